@@ -1,0 +1,3 @@
+//! The `telemime` command.
+
+fn main() {}
