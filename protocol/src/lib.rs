@@ -5,5 +5,6 @@
 //! This crate has no clock, no I/O and no platform-dependent mathematics, and a query never allocates.
 
 pub mod predict;
+pub mod skill;
 pub mod time;
 pub mod wire;
