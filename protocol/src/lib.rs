@@ -6,5 +6,6 @@
 
 pub mod predict;
 pub mod skill;
+pub mod spline;
 pub mod time;
 pub mod wire;
