@@ -4,6 +4,7 @@
 pub mod codec;
 pub mod frame;
 pub mod hello;
+pub mod knots;
 pub mod state;
 pub mod v1;
 

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::codec::{self, DecodeError};
 use super::frame::MAX_FRAME_LEN;
 use super::state::WireState;
+use crate::predict::Params;
 
 /// The version this module speaks.
 pub const VERSION: u16 = 1;
@@ -96,10 +97,8 @@ pub enum Drive {
         state: WireState,
         /// As in [`Motion::model`].
         model: u16,
-        /// As in [`Motion::gain`].
-        gain: u8,
-        /// As in [`Motion::trust`].
-        trust: u8,
+        /// As in [`Motion::params`].
+        params: WireParams,
     },
     /// A plan sent before.
     Play {
@@ -230,6 +229,8 @@ pub enum Refusal {
     BadMapping,
     /// The arm still moves.
     Moving,
+    /// The two ends compute different predictions; the robot goes on with constant velocity.
+    Diverged,
 }
 
 /// Operator → robot, datagrams.
@@ -281,10 +282,8 @@ pub struct Motion {
     pub lease_ms: u16,
     /// [`model_tag`] of the model to predict with; 0 is constant velocity.
     pub model: u16,
-    /// Prediction gain κ in 1/255.
-    pub gain: u8,
-    /// Weight of the mixture against constant velocity in 1/255.
-    pub trust: u8,
+    /// Parameters to predict with.
+    pub params: WireParams,
     /// Checksum of the operator's own prediction from `state`, in keyframes.
     pub checksum: Option<u32>,
     /// The newest hand state.
@@ -295,14 +294,40 @@ pub struct Motion {
     pub knots: Vec<WireKnot>,
 }
 
-/// A knot of the path, in steps that follow from `Engage::path_bound_um`.
+/// `predict::Params` in steps of 1/255.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WireParams {
+    /// Prediction gain κ.
+    pub gain: u8,
+    /// Weight of the mixture against constant velocity.
+    pub trust: u8,
+    /// Factor on the constant velocity.
+    pub cv_damping: u8,
+}
+
+impl WireParams {
+    /// The nearest parameters that can travel.
+    pub fn quantise(params: &Params) -> Self {
+        let step = |v: f64| (v * 255.0).round() as u8;
+        Self { gain: step(params.gain), trust: step(params.trust), cv_damping: step(params.cv_damping) }
+    }
+
+    /// The parameters both ends use.
+    pub fn dequantise(self) -> Params {
+        let value = |v: u8| f64::from(v) / 255.0;
+        Params { gain: value(self.gain), trust: value(self.trust), cv_damping: value(self.cv_damping) }
+    }
+}
+
+/// A knot of the path, relative to the one before it in the message; [`super::knots`] converts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WireKnot {
-    /// Since the knot before it in the message (the first: since `state.t_us`, backwards), µs.
-    pub dt_us: u32,
-    /// Position minus that of the knot before (the first: minus the message's state), position steps.
+    /// Distance in time: twice the ticks, plus 1 if the path starts afresh here. The first knot counts
+    /// backwards from the message's state, the others forwards from the knot before.
+    pub dt: u32,
+    /// Position minus that of the knot before (the first: minus the message's state), in steps.
     pub dx: [i32; 3],
-    /// Tangent, speed steps.
+    /// Tangent, in steps.
     pub v: [i32; 3],
 }
 
