@@ -2,6 +2,7 @@
 //! TLS that trusts pinned keys only, and QUIC set up for teleoperation.
 
 pub mod clock;
+pub mod control;
 pub mod identity;
 pub mod meter;
 pub mod quic;

@@ -34,6 +34,10 @@ pub struct Traffic {
 }
 
 impl Traffic {
+    fn since(self, earlier: Self) -> Self {
+        Self { packets: self.packets - earlier.packets, bytes: self.bytes - earlier.bytes }
+    }
+
     fn add(&mut self, packets: u64, udp_bytes: u64) {
         self.packets += packets;
         self.bytes += udp_bytes + packets * IP_UDP_HEADER;
@@ -49,6 +53,18 @@ pub struct Counts {
     pub received: Traffic,
     /// Of what was sent, the packets that carried a marked datagram.
     pub motion: Traffic,
+}
+
+impl Counts {
+    /// What has been counted after `earlier`, a former reading of the same meter.
+    #[must_use]
+    pub fn since(self, earlier: Self) -> Self {
+        Self {
+            sent: self.sent.since(earlier.sent),
+            received: self.received.since(earlier.received),
+            motion: self.motion.since(earlier.motion),
+        }
+    }
 }
 
 #[derive(Debug, Default)]
