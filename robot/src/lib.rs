@@ -1,1 +1,3 @@
-//! Telemime robot.
+//! The robot daemon: decodes, predicts, keeps safe, drives the arm.
+
+pub mod control;
