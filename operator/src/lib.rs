@@ -1,1 +1,4 @@
 //! Telemime operator.
+
+pub mod demonstration;
+pub mod learn;
