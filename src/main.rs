@@ -1,3 +1,5 @@
 //! The `telemime` command.
 
+mod figure;
+
 fn main() {}
