@@ -5,10 +5,10 @@ use telemime_endpoint::Mono;
 use telemime_protocol::predict::Forecast;
 use telemime_protocol::spline::BSpline;
 use telemime_protocol::wire::v1::{Cause, RobotState};
-use telemime_sim::arm::{Joints, Plant};
+use telemime_sim::arm::{Joints, Plant, PlantReport};
 
 use super::mapping::Mapping;
-use crate::control::{Controller, Demand};
+use crate::control::{Clamps, Controller, Demand};
 use crate::safety::{Safety, SafetyConfig};
 
 /// A fresh engage eases the mapped displacement in over this time, s (driving.md §7).
@@ -188,6 +188,7 @@ pub struct Core {
     engagement: u32,
     engaged_at: Mono,
     clamps: u32,
+    out_of_reach: bool,
     tick: u64,
     tip_m: Vector3<f64>,
     target_m: Vector3<f64>,
@@ -198,7 +199,7 @@ pub struct Core {
 impl Core {
     /// A servo at rest.
     pub fn new(config: CoreConfig, controller: Controller, plant: Plant, rings: Rings) -> Self {
-        let tip_m = controller.tip_m();
+        let tip_m = controller.reference().p;
         let mapping =
             Mapping { scale: 1.0, rotation: UnitQuaternion::identity(), hand_m: Vector3::zeros(), tip_m };
         Self {
@@ -212,6 +213,7 @@ impl Core {
             engagement: 0,
             engaged_at: Mono(0),
             clamps: 0,
+            out_of_reach: false,
             tick: 0,
             tip_m,
             target_m: tip_m,
@@ -233,11 +235,12 @@ impl Core {
         self.safety.tick(now);
         let demand = self.demand(now);
         let output = self.controller.tick(demand, self.plant.q(), self.plant.qd());
-        let strained = self.plant.step(&output.tau, self.config.tick_s).limited();
-        if self.safety.is_following() && (output.clamped() || strained) {
+        let strain = self.plant.step(&output.tau, self.config.tick_s);
+        let limited = output.clamps != Clamps::default() || strain != PlantReport::default();
+        if self.safety.is_following() && (limited || self.out_of_reach) {
             self.clamps += 1;
         }
-        self.tip_m = output.tip_m;
+        self.tip_m = output.tip;
         self.reference_m = output.reference.p;
         self.moving = output.reference.v.norm() > STILL_M_S;
         self.tick += 1;
@@ -277,12 +280,12 @@ impl Core {
         }
         let hand_m = match &drive {
             Drive::Mirror { forecast, valid_at } => forecast.at(now.secs_since(*valid_at)).position,
-            Drive::Play(trajectory) => trajectory.spline.eval(0.0).map_or(Vector3::zeros(), |jet| jet.position),
+            Drive::Play(trajectory) => trajectory.spline.eval(0.0).map_or(Vector3::zeros(), |jet| jet.x),
             Drive::Nothing => Vector3::zeros(),
         };
         let old = std::mem::replace(&mut self.drive, drive);
         self.discard(old);
-        let tip_m = self.controller.hold_here(self.plant.q());
+        let tip_m = self.controller.reset_reference(self.plant.q());
         self.mapping = Mapping { scale: engagement.scale, rotation: engagement.rotation, hand_m, tip_m };
         self.engagement = engagement.number;
         self.engaged_at = now;
@@ -299,6 +302,7 @@ impl Core {
     }
 
     fn demand(&mut self, now: Mono) -> Demand {
+        self.out_of_reach = false;
         if !self.safety.is_following() {
             return Demand::Stop;
         }
@@ -314,17 +318,15 @@ impl Core {
                     return Demand::Stop;
                 }
                 let t_s = (since_s + self.config.lag_s).min(trajectory.duration_s);
-                trajectory.spline.eval(t_s).map_or(self.mapping.hand_m, |jet| jet.position)
+                trajectory.spline.eval(t_s).map_or(self.mapping.hand_m, |jet| jet.x)
             }
         };
         let (placed, clamped) = self.mapping.place(hand_m, self.config.radius_m);
-        if clamped {
-            self.clamps += 1;
-        }
+        self.out_of_reach = clamped;
         let u = (since_s / RAMP_S).clamp(0.0, 1.0);
         let ramp = u * u * (3.0 - 2.0 * u);
         self.target_m = self.mapping.tip_m + (placed - self.mapping.tip_m) * ramp;
-        Demand::Follow { target_m: self.target_m, speed_scale: self.safety.speed_scale(now) }
+        Demand::Follow { target: self.target_m, speed_scale: self.safety.speed_scale(now) }
     }
 
     fn report(&self, now: Mono) -> Report {
