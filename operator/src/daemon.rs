@@ -21,7 +21,7 @@ use crate::session::{Counters, Event, Output, Session, SessionConfig};
 use crate::task::{Advice, Outcome, Task};
 
 /// The first attempt to connect is given this long; later ones twice as long each.
-const FIRST_ATTEMPT: Duration = Duration::from_millis(500);
+const FIRST_ATTEMPT: Duration = Duration::from_secs(1);
 const LONGEST_ATTEMPT: Duration = Duration::from_secs(10);
 
 /// Pause between attempts.

@@ -133,6 +133,16 @@ impl Rig {
         }
     }
 
+    /// A controller and a plant at the start posture, for a run without a session.
+    pub fn parts(&self) -> (Controller, Plant) {
+        (self.controller.clone(), self.plant.clone())
+    }
+
+    /// The servo's period, s.
+    pub fn tick_s(&self) -> f64 {
+        self.config.tick_s
+    }
+
     /// From predicted target to tip, s.
     pub fn lag_s(&self) -> f64 {
         self.config.lag_s

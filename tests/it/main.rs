@@ -1,3 +1,4 @@
 //! Integration tests: one binary, one module a file.
 
+mod mirror;
 mod prediction;

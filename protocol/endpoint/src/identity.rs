@@ -117,6 +117,11 @@ impl Identity {
         Self::from_key(KeyPair::from_pkcs8_pem_and_sign_algo(pem, &PKCS_ED25519)?)
     }
 
+    /// The private key as a PEM text: to be kept as carefully as the key itself.
+    pub fn to_pem(&self) -> String {
+        self.key.serialize_pem()
+    }
+
     /// Reads the key at `path`, or makes one there (mode 0600) at the first start.
     ///
     /// # Errors
@@ -166,7 +171,7 @@ impl Identity {
             .mode(0o600)
             .open(path)
             .map_err(io)?;
-        file.write_all(self.key.serialize_pem().as_bytes())
+        file.write_all(self.to_pem().as_bytes())
             .and_then(|()| file.sync_all())
             .map_err(io)
     }

@@ -12,13 +12,19 @@ use crate::control::{Clamps, Controller, Demand};
 use crate::safety::{Safety, SafetyConfig};
 
 /// A fresh engage eases the mapped displacement in over this time, s (driving.md §7).
-const RAMP_S: f64 = 0.5;
+pub const RAMP_S: f64 = 0.5;
 
 /// Below this tip speed the arm counts as still, m/s.
 const STILL_M_S: f64 = 1e-3;
 
 /// After a plan's end the arm gets this long to arrive, s.
 const SETTLE_S: f64 = 0.3;
+
+/// From 0 at 0 to 1 at 1, smoothly.
+pub fn ramp(u: f64) -> f64 {
+    let u = u.clamp(0.0, 1.0);
+    u * u * (3.0 - 2.0 * u)
+}
 
 /// A motion to play: hand position in m over time in s from 0.
 #[derive(Debug)]
@@ -31,6 +37,7 @@ pub struct Trajectory {
 
 /// What drives an engagement.
 #[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "a box would be allocated per message and freed on the tick")]
 pub enum Source {
     /// The hand, live: a forecast and when its state was valid on the robot's clock.
     Mirror {
@@ -170,6 +177,7 @@ pub fn rings() -> (Rings, Handle) {
     (Rings { orders, reports, spent }, Handle { orders: order_in, reports: report_out, spent: spent_out })
 }
 
+#[expect(clippy::large_enum_variant, reason = "a box would be allocated per message and freed on the tick")]
 enum Drive {
     Nothing,
     Mirror { forecast: Forecast, valid_at: Mono },
@@ -323,9 +331,7 @@ impl Core {
         };
         let (placed, clamped) = self.mapping.place(hand_m, self.config.radius_m);
         self.out_of_reach = clamped;
-        let u = (since_s / RAMP_S).clamp(0.0, 1.0);
-        let ramp = u * u * (3.0 - 2.0 * u);
-        self.target_m = self.mapping.tip_m + (placed - self.mapping.tip_m) * ramp;
+        self.target_m = self.mapping.tip_m + (placed - self.mapping.tip_m) * ramp(since_s / RAMP_S);
         Demand::Follow { target: self.target_m, speed_scale: self.safety.speed_scale(now) }
     }
 

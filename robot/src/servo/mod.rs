@@ -8,6 +8,6 @@ mod mapping;
 mod stats;
 pub mod thread;
 
-pub use self::core::{Core, CoreConfig, Engagement, Handle, Order, Report, Rings, Source, Trajectory, rings};
+pub use self::core::{Core, CoreConfig, Engagement, Handle, Order, RAMP_S, Report, Rings, Source, Trajectory, ramp, rings};
 pub use mapping::Mapping;
 pub use stats::TickStats;

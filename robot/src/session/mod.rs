@@ -49,6 +49,7 @@ impl Default for SessionConfig {
 
 /// What a session wants done.
 #[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "moved once, into the servo's ring")]
 pub enum Output {
     /// A message for the control stream, not yet framed.
     Control(Vec<u8>),
