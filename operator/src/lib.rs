@@ -2,3 +2,4 @@
 
 pub mod demonstration;
 pub mod learn;
+pub mod skill_file;
