@@ -5,4 +5,5 @@ pub mod daemon;
 pub mod demonstration;
 pub mod learn;
 pub mod session;
+pub mod skill_file;
 pub mod task;
