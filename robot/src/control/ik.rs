@@ -259,7 +259,7 @@ impl DifferentialIk {
 }
 
 /// The largest share in [0, 1] of `addend` that keeps `base + share·addend` within the bounds; `base` is within them.
-fn largest_share(base: &Joints, addend: &Joints, lower: &Joints, upper: &Joints) -> f64 {
+pub(super) fn largest_share(base: &Joints, addend: &Joints, lower: &Joints, upper: &Joints) -> f64 {
     let mut share = 1.0_f64;
     for i in 0..MAX_JOINTS {
         let bound = if addend[i] > 0.0 { upper[i] } else { lower[i] };
