@@ -74,8 +74,8 @@ pub(super) fn resolve(
     let inverse = damped_inverse(&gram, damping);
     let primary = linear.transpose() * (inverse * tip_velocity);
     let freed = angular - (angular * linear.transpose()) * inverse * linear;
-    // 0.05 rad/rad: an arm of five axes never has a free rotation about every axis.
-    let inverse_freed = damped_inverse(&(freed * freed.transpose()), 0.05 * 0.05);
+    // 0.2 rad/rad: an arm of five axes never has a free rotation about every axis, and what it lacks must not be bought dearly.
+    let inverse_freed = damped_inverse(&(freed * freed.transpose()), 0.2 * 0.2);
     let left_over = angular_velocity - angular * primary;
     let idle = posture_velocity - linear.transpose() * (inverse * (linear * posture_velocity));
     let secondary = idle + freed.transpose() * (inverse_freed * (left_over - freed * idle));

@@ -264,7 +264,7 @@ fn reach(arm: &ArmModel, home: &Joints, direction: &Vector3<f64>, at_most: f64) 
     let mut reached = 0.0;
     while reached + STEP_M <= at_most {
         let target = start + direction * (reached + STEP_M);
-        for _ in 0..6 {
+        for iteration in 0..6 {
             kinematics.update(arm, &q);
             let turn = orientation_error(kinematics.tip_rotation(), &orientation);
             let step = resolve(
@@ -280,8 +280,11 @@ fn reach(arm: &ArmModel, home: &Joints, direction: &Vector3<f64>, at_most: f64) 
             );
             let primary =
                 step.primary * largest_share(&Joints::zeros(), &step.primary, &lower, &upper);
-            q +=
-                primary + step.secondary * largest_share(&primary, &step.secondary, &lower, &upper);
+            q += primary;
+            // Last, only what the tip's place still needs: a large idle motion moves it to second order.
+            if iteration < 4 {
+                q += step.secondary * largest_share(&primary, &step.secondary, &lower, &upper);
+            }
         }
         kinematics.update(arm, &q);
         let now = resolve(&kinematics.jacobian(), &zero, &zero, &Joints::zeros(), 0.0);
