@@ -74,8 +74,8 @@ pub(super) fn resolve(
     let inverse = damped_inverse(&gram, damping);
     let primary = linear.transpose() * (inverse * tip_velocity);
     let freed = angular - (angular * linear.transpose()) * inverse * linear;
-    // 0.05 rad/rad: an arm of five axes never has a free rotation about every axis.
-    let inverse_freed = damped_inverse(&(freed * freed.transpose()), 0.05 * 0.05);
+    // 0.2 rad/rad: an arm of five axes never has a free rotation about every axis, and what it lacks must not be bought dearly.
+    let inverse_freed = damped_inverse(&(freed * freed.transpose()), 0.2 * 0.2);
     let left_over = angular_velocity - angular * primary;
     let idle = posture_velocity - linear.transpose() * (inverse * (linear * posture_velocity));
     let secondary = idle + freed.transpose() * (inverse_freed * (left_over - freed * idle));
@@ -259,7 +259,7 @@ impl DifferentialIk {
 }
 
 /// The largest share in [0, 1] of `addend` that keeps `base + share·addend` within the bounds; `base` is within them.
-fn largest_share(base: &Joints, addend: &Joints, lower: &Joints, upper: &Joints) -> f64 {
+pub(super) fn largest_share(base: &Joints, addend: &Joints, lower: &Joints, upper: &Joints) -> f64 {
     let mut share = 1.0_f64;
     for i in 0..MAX_JOINTS {
         let bound = if addend[i] > 0.0 { upper[i] } else { lower[i] };

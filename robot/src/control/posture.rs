@@ -1,12 +1,12 @@
 //! Where to start, how far the tip can go from there, and how fast.
 
-use nalgebra::{Matrix6, SMatrix, Vector3};
+use nalgebra::{Matrix6, SMatrix, Vector2, Vector3};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use telemime_sim::arm::{ArmModel, Dynamics, Joint, Joints, Kinematics, MAX_JOINTS};
 
 use super::ControlError;
-use super::ik::{min_eigenvalue, orientation_error, resolve};
+use super::ik::{largest_share, min_eigenvalue, orientation_error, resolve};
 
 /// Speed, acceleration and jerk of the tip that every direction allows at a posture.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -91,43 +91,63 @@ pub fn joint_accelerations(arm: &ArmModel, q: &Joints) -> Result<Joints, Control
     Ok(out)
 }
 
-/// A posture to start from: joints well inside their ranges, the tip free to move and turn in every direction, in front of the base (+x) and clear of
-/// the floor (z = 0). The best of a fixed, seeded set of candidates, refined; the same for the same arm.
+/// A posture to start from: joints well inside their ranges, the tip free to move and turn in every direction, in front of the base and clear of
+/// the floor (z = 0). Front is the base axis (±x or ±y) nearest to where the tip points with all joints mid-range, +x if that is straight up.
+/// The best of a fixed, seeded set of candidates, refined; the same for the same arm.
 pub fn home_posture(arm: &ArmModel) -> Joints {
+    let middle = arm.per_joint(Joint::mid);
+    let mut kinematics = Kinematics::new();
+    kinematics.update(arm, &middle);
     let mut search = Search {
         arm,
-        kinematics: Kinematics::new(),
+        front: front(&kinematics.tip(), 0.1 * arm.chain_length_m()),
+        kinematics,
     };
     let mut rng = Xoshiro256PlusPlus::seed_from_u64(0x7e1e_313e);
-    let mut best = arm.per_joint(Joint::mid);
-    let mut best_score = search.score(&best);
-    let mut consider = |q: Joints, best: &mut Joints, best_score: &mut f64| {
-        let score = search.score(&q);
-        if score > *best_score {
-            (*best, *best_score) = (q, score);
-        }
-    };
+    let mut best = (search.score(&middle), middle);
     for _ in 0..4000 {
         let mut q = Joints::zeros();
         for (q, joint) in q.iter_mut().zip(arm.joints()) {
             let (lower, upper) = window(joint);
             *q = lower + (upper - lower) * unit(&mut rng);
         }
-        consider(q, &mut best, &mut best_score);
+        search.consider(q, &mut best);
     }
-    let mut span = 0.2;
+    let mut span = 0.3;
     while span > 1e-3 {
+        let before = best.0;
         for i in 0..arm.dof() {
             let (lower, upper) = window(&arm.joints()[i]);
             for sign in [-1.0, 1.0] {
-                let mut q = best;
+                let mut q = best.1;
                 q[i] = (q[i] + sign * span * 0.5 * (upper - lower)).clamp(lower, upper);
-                consider(q, &mut best, &mut best_score);
+                search.consider(q, &mut best);
+            }
+            // The middle of one joint is often paid for by the others: offer it with each neighbour's step.
+            for j in 0..arm.dof() {
+                for sign in [-1.0, 1.0] {
+                    let (lower, upper) = window(&arm.joints()[j]);
+                    let mut q = best.1;
+                    q[i] += 0.5 * (arm.joints()[i].mid() - q[i]);
+                    q[j] = (q[j] + sign * span * 0.5 * (upper - lower)).clamp(lower, upper);
+                    search.consider(q, &mut best);
+                }
             }
         }
-        span *= 0.8;
+        if best.0 <= before {
+            span *= 0.7;
+        }
     }
-    best
+    best.1
+}
+
+/// The horizontal base axis nearest to `tip`; +x if the tip is within `near` of the vertical.
+fn front(tip: &Vector3<f64>, near: f64) -> Vector2<f64> {
+    match tip.xy() {
+        t if t.norm() < near => Vector2::x(),
+        t if t.x.abs() >= t.y.abs() => Vector2::new(t.x.signum(), 0.0),
+        t => Vector2::new(0.0, t.y.signum()),
+    }
 }
 
 /// Uniform in [0, 1).
@@ -144,10 +164,18 @@ fn window(joint: &Joint) -> (f64, f64) {
 
 struct Search<'a> {
     arm: &'a ArmModel,
+    front: Vector2<f64>,
     kinematics: Kinematics,
 }
 
 impl Search<'_> {
+    fn consider(&mut self, q: Joints, best: &mut (f64, Joints)) {
+        let score = self.score(&q);
+        if score > best.0 {
+            *best = (score, q);
+        }
+    }
+
     /// Product of conditioning, dexterity, distance from the joints' ends and placement of the tip; each at most about 1.
     fn score(&mut self, q: &Joints) -> f64 {
         self.kinematics.update(self.arm, q);
@@ -166,20 +194,21 @@ impl Search<'_> {
         } else {
             1.0
         };
-        let mut margin = 1.0_f64;
+        let (mut margin, mut centred) = (1.0_f64, 1.0_f64);
         for (joint, q) in self.arm.joints().iter().zip(q.iter()) {
             let (lower, upper) = window(joint);
             let off = (q - 0.5 * (lower + upper)) / (0.5 * (upper - lower));
             margin = margin.min(1.0 - off * off);
+            centred *= (1.0 - off * off).max(0.0);
         }
-        conditioning * dexterity * margin.max(0.0).powf(0.25) * self.placement(length)
+        conditioning * dexterity * (margin.max(0.0) * centred).powf(0.25) * self.placement(length)
     }
 
     fn placement(&self, length: f64) -> f64 {
         let tip = self.kinematics.tip();
         let out = tip.xy().norm();
         let in_front = if out > 0.0 {
-            (tip.x / out).max(0.0)
+            (tip.xy().dot(&self.front) / out).max(0.0)
         } else {
             0.0
         };
@@ -188,6 +217,10 @@ impl Search<'_> {
             let slack = (low - x).max(x - high).max(0.0) / (high - low);
             (1.0 - slack).max(0.0)
         };
+        let extension = self
+            .kinematics
+            .joint_frame(1)
+            .map_or(out, |(shoulder, _)| (tip - shoulder.coords).norm());
         let mut clear = 1.0_f64;
         for i in 1..self.arm.dof() {
             if let Some((origin, _)) = self.kinematics.joint_frame(i) {
@@ -195,8 +228,9 @@ impl Search<'_> {
             }
         }
         in_front.powi(4)
-            * fit(out / length, 0.4, 0.65)
-            * fit(tip.z / length, 0.25, 0.6)
+            * fit(out / length, 0.3, 0.6)
+            * fit(extension / length, 0.4, 0.6)
+            * fit(tip.z / length, 0.35, 0.65)
             * clear.max(0.0)
     }
 }
@@ -230,7 +264,7 @@ fn reach(arm: &ArmModel, home: &Joints, direction: &Vector3<f64>, at_most: f64) 
     let mut reached = 0.0;
     while reached + STEP_M <= at_most {
         let target = start + direction * (reached + STEP_M);
-        for _ in 0..6 {
+        for iteration in 0..6 {
             kinematics.update(arm, &q);
             let turn = orientation_error(kinematics.tip_rotation(), &orientation);
             let step = resolve(
@@ -240,9 +274,16 @@ fn reach(arm: &ArmModel, home: &Joints, direction: &Vector3<f64>, at_most: f64) 
                 &((home - q) * 0.02),
                 0.0,
             );
-            q += step.primary + step.secondary;
-            for (q, joint) in q.iter_mut().zip(arm.joints()) {
-                *q = q.clamp(joint.lower, joint.upper);
+            let (lower, upper) = (
+                arm.per_joint(|j| j.lower) - q,
+                arm.per_joint(|j| j.upper) - q,
+            );
+            let primary =
+                step.primary * largest_share(&Joints::zeros(), &step.primary, &lower, &upper);
+            q += primary;
+            // Last, only what the tip's place still needs: a large idle motion moves it to second order.
+            if iteration < 4 {
+                q += step.secondary * largest_share(&primary, &step.secondary, &lower, &upper);
             }
         }
         kinematics.update(arm, &q);
