@@ -3,6 +3,8 @@
 mod figure;
 mod paper;
 
+use std::process::ExitCode;
+
 use clap::Parser;
 
 /// Teleoperation that learns the operator's skills.
@@ -13,8 +15,15 @@ enum Command {
     Paper(paper::Args),
 }
 
-fn main() -> anyhow::Result<()> {
-    match Command::parse() {
+fn main() -> ExitCode {
+    let done = match Command::parse() {
         Command::Paper(args) => paper::run(&args),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => {
+            eprintln!("telemime: {e:#}");
+            ExitCode::FAILURE
+        }
     }
 }

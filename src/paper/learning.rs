@@ -42,7 +42,7 @@ fn options() -> EmOptions {
         standardise: false,
         ridge: 1e-6,
         max_iterations: 500,
-        restarts: 8,
+        restarts: 24,
         ..EmOptions::default()
     }
 }

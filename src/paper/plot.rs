@@ -58,7 +58,7 @@ fn row(task: &Shown) -> [Panel; 3] {
         Layer::new(label, VERMILLION, Shape::Rings(points))
     };
     let panel = |what: &str, x_label: &str, y_label: &str, layers| Panel {
-        title: format!("{}: {what}", task.name),
+        title: format!("{}: {what}", task.name.replace("task", "task ")),
         x_label: x_label.into(),
         y_label: y_label.into(),
         equal_axes: false,
