@@ -1,10 +1,11 @@
 //! The publication's learning block: a mixture over (t, x1, x2), regressed on time.
 
-use nalgebra::{Vector1, Vector2, Vector3};
+use nalgebra::{Vector1, Vector3};
 use telemime_operator::learn::em::{self, EmOptions};
-use telemime_operator::learn::{LearnError, select};
+use telemime_operator::learn::select;
 use telemime_protocol::skill::{Gmm, Gmr};
 
+use super::Series;
 use super::task::times;
 
 /// Components in the publication.
@@ -16,11 +17,11 @@ pub(super) struct Inferred {
     /// Components of the mixture.
     pub(super) components: usize,
     /// The regression's mean.
-    pub(super) motion: Vec<Vector2<f64>>,
+    pub(super) motion: Series,
 }
 
 /// Plain EM with the publication's three components. (It used a variational mixture.)
-pub(super) fn three_components(demonstrations: &[Vec<Vector2<f64>>]) -> anyhow::Result<Inferred> {
+pub(super) fn three_components(demonstrations: &[Series]) -> anyhow::Result<Inferred> {
     let options = EmOptions {
         components: PUBLISHED_K,
         ..options()
@@ -30,9 +31,8 @@ pub(super) fn three_components(demonstrations: &[Vec<Vector2<f64>>]) -> anyhow::
 }
 
 /// Plain EM with as many components as the Bayesian information criterion asks for.
-pub(super) fn chosen_components(demonstrations: &[Vec<Vector2<f64>>]) -> anyhow::Result<Inferred> {
-    let selection = select::select(&rows(demonstrations), 2..=12, 3, &options(), |_| {})
-        .map_err(|e: LearnError| anyhow::Error::from(e))?;
+pub(super) fn chosen_components(demonstrations: &[Series]) -> anyhow::Result<Inferred> {
+    let selection = select::select(&rows(demonstrations), 2..=12, 3, &options(), |_| {})?;
     regressed(&selection.best.gmm, demonstrations)
 }
 
@@ -47,8 +47,8 @@ fn options() -> EmOptions {
     }
 }
 
-fn rows(demonstrations: &[Vec<Vector2<f64>>]) -> Vec<Vector3<f64>> {
-    let each = |demonstration: &Vec<Vector2<f64>>| {
+fn rows(demonstrations: &[Series]) -> Vec<Vector3<f64>> {
+    let each = |demonstration: &Series| {
         let t = times(demonstration.len());
         let rows = t.into_iter().zip(demonstration);
         rows.map(|(t, x)| Vector3::new(t, x.x, x.y))
@@ -57,7 +57,7 @@ fn rows(demonstrations: &[Vec<Vector2<f64>>]) -> Vec<Vector3<f64>> {
     demonstrations.iter().flat_map(each).collect()
 }
 
-fn regressed(gmm: &Gmm<3>, demonstrations: &[Vec<Vector2<f64>>]) -> anyhow::Result<Inferred> {
+fn regressed(gmm: &Gmm<3>, demonstrations: &[Series]) -> anyhow::Result<Inferred> {
     let gmr = Gmr::<1, 2>::new(gmm)?;
     let instants = demonstrations.first().map_or(2, Vec::len);
     Ok(Inferred {

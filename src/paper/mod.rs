@@ -21,6 +21,9 @@ use plot::Shown;
 use report::{Baseline, Baselines, Block, Pipeline, Report, TaskReport};
 use task::Task;
 
+/// (x1, x2) at evenly spread instants.
+type Series = Vec<Vector2<f64>>;
+
 /// Reproduce the tables of the source publication beside ours.
 #[derive(clap::Args, Debug)]
 pub(crate) struct Args {
@@ -113,16 +116,13 @@ struct Inputs {
     published: Option<Pipeline>,
     /// How the inferred motions came about.
     how: [String; 2],
-    truth: Vec<Vector2<f64>>,
-    theirs: Vec<Vector2<f64>>,
-    ours: Vec<Vector2<f64>>,
+    truth: Series,
+    theirs: Series,
+    ours: Series,
 }
 
 impl Inputs {
-    fn evaluate(
-        self,
-        demonstrations: Vec<Vec<Vector2<f64>>>,
-    ) -> anyhow::Result<(TaskReport, Shown)> {
+    fn evaluate(self, demonstrations: Vec<Series>) -> anyhow::Result<(TaskReport, Shown)> {
         let context = || format!("{}: the motion cannot be coded", self.name);
         let kept =
             codec::publication_indices(&self.theirs, self.threshold).with_context(context)?;

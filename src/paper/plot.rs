@@ -2,16 +2,21 @@
 
 use nalgebra::Vector2;
 
+use super::Series;
 use super::codec::Coded;
 use super::task::times;
 use crate::figure::{BLACK, BLUE, Figure, GREY, Layer, Panel, SKY, Shape, VERMILLION};
+
+type Points = Vec<(f64, f64)>;
+/// A checkpoint: when, and where.
+type Mark = (f64, Vector2<f64>);
 
 /// What the figure shows of one task.
 pub(super) struct Shown {
     pub(super) name: &'static str,
     /// Empty where only the series are known.
-    pub(super) demonstrations: Vec<Vec<Vector2<f64>>>,
-    pub(super) truth: Vec<Vector2<f64>>,
+    pub(super) demonstrations: Vec<Series>,
+    pub(super) truth: Series,
     /// The publication's method.
     pub(super) reproduced: Coded,
     /// Ours.
@@ -32,11 +37,11 @@ pub(super) fn figure(tasks: &[Shown]) -> Figure {
 
 fn row(task: &Shown) -> [Panel; 3] {
     let t = times(task.truth.len());
-    let over = |x: &[Vector2<f64>], d: usize| -> Vec<(f64, f64)> {
+    let over = |x: &[Vector2<f64>], d: usize| -> Points {
         t.iter().zip(x).map(|(t, x)| (*t, x[d])).collect()
     };
-    let path = |x: &[Vector2<f64>]| -> Vec<(f64, f64)> { x.iter().map(|x| (x.x, x.y)).collect() };
-    let curves = |view: &dyn Fn(&[Vector2<f64>]) -> Vec<(f64, f64)>| {
+    let path = |x: &[Vector2<f64>]| -> Points { x.iter().map(|x| (x.x, x.y)).collect() };
+    let curves = |view: &dyn Fn(&[Vector2<f64>]) -> Points| {
         vec![
             Layer::new(
                 "published method",
@@ -47,12 +52,12 @@ fn row(task: &Shown) -> [Panel; 3] {
             Layer::new("ours", SKY, Shape::Dashed(view(&task.ours.decoded))),
         ]
     };
-    let dots = |view: &dyn Fn(&(f64, Vector2<f64>)) -> (f64, f64)| {
+    let dots = |view: &dyn Fn(&Mark) -> (f64, f64)| {
         let points: Vec<_> = task.ours.checkpoints.iter().map(view).collect();
         let label = format!("our {} checkpoints", points.len());
         Layer::new(label, BLUE, Shape::Dots(points))
     };
-    let rings = |view: &dyn Fn(&(f64, Vector2<f64>)) -> (f64, f64)| {
+    let rings = |view: &dyn Fn(&Mark) -> (f64, f64)| {
         let points: Vec<_> = task.reproduced.checkpoints.iter().map(view).collect();
         let label = format!("its {} checkpoints", points.len());
         Layer::new(label, VERMILLION, Shape::Rings(points))

@@ -5,9 +5,11 @@ use std::path::Path;
 use anyhow::{Context, bail, ensure};
 use nalgebra::Vector2;
 
+use super::Series;
+
 /// Reads `ground_truth.csv` and `inferred.csv` of `dir`, and nothing else: what comes out of a codec is
 /// computed here, never read.
-pub(super) fn read(dir: &Path) -> anyhow::Result<(Vec<Vector2<f64>>, Vec<Vector2<f64>>)> {
+pub(super) fn read(dir: &Path) -> anyhow::Result<(Series, Series)> {
     let truth = column_pair(&dir.join("ground_truth.csv"))?;
     let inferred = column_pair(&dir.join("inferred.csv"))?;
     ensure!(
@@ -20,7 +22,7 @@ pub(super) fn read(dir: &Path) -> anyhow::Result<(Vec<Vector2<f64>>, Vec<Vector2
     Ok((truth, inferred))
 }
 
-fn column_pair(path: &Path) -> anyhow::Result<Vec<Vector2<f64>>> {
+fn column_pair(path: &Path) -> anyhow::Result<Series> {
     let mut reader = csv::ReaderBuilder::new()
         .trim(csv::Trim::All)
         .from_path(path)

@@ -2,6 +2,8 @@
 
 use nalgebra::Vector2;
 
+use super::Series;
+
 /// Samples of one demonstration.
 pub(super) const STEPS: usize = 50;
 
@@ -46,7 +48,7 @@ impl Task {
     }
 
     /// Its demonstrations (x1, x2) at [`times`]; the first one is what it calls the ground truth.
-    pub(super) fn demonstrations(self) -> Vec<Vec<Vector2<f64>>> {
+    pub(super) fn demonstrations(self) -> Vec<Series> {
         let t = times(STEPS);
         let base = standardised(t.iter().map(|&t| {
             const FLOOR: f64 = -854_112.8;

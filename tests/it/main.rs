@@ -1,3 +1,5 @@
 //! Integration tests: one binary, one module a file.
 
+mod codec;
+mod paper;
 mod prediction;
