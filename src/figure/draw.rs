@@ -16,6 +16,9 @@ use super::{Figure, FigureError, Layer, Panel, Shape};
 type Axes<'a, DB> = ChartContext<'a, DB, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 type Drawn = Result<(), FigureError>;
 
+/// SVG: the backend knows whole units only, so the page is drawn this much larger than it is shown.
+const SVG_SCALE: u32 = 8;
+
 /// PNG: drawn this many times larger than it is written, then averaged, because the bitmap backend
 /// draws its lines without smoothing.
 const OVERSAMPLE: u32 = 2;
@@ -23,12 +26,15 @@ const PNG_SCALE: u32 = 2;
 
 pub(super) fn svg(figure: &Figure) -> Result<String, FigureError> {
     let mut text = String::new();
-    let size = size(figure)?;
-    let root = SVGBackend::with_string(&mut text, size).into_drawing_area();
-    page(figure, &root, 1.0)?;
+    let (w, h) = size(figure)?;
+    let (large_w, large_h) = (w * SVG_SCALE, h * SVG_SCALE);
+    let root = SVGBackend::with_string(&mut text, (large_w, large_h)).into_drawing_area();
+    page(figure, &root, f64::from(SVG_SCALE))?;
     root.present().map_err(draw_error)?;
     drop(root);
-    Ok(text)
+    // Its view box stays; the size it is shown at is the page's.
+    let drawn = format!("width=\"{large_w}\" height=\"{large_h}\"");
+    Ok(text.replacen(&drawn, &format!("width=\"{w}\" height=\"{h}\""), 1))
 }
 
 pub(super) fn png(figure: &Figure, path: &Path) -> Drawn {
@@ -125,8 +131,8 @@ where
     DB::ErrorType: 'static,
 {
     let px = |units: f64| (units * k).round() as i32;
-    let (label_w, label_h, right) = (px(54.0), px(42.0), px(16.0));
-    let mut top = px(8.0);
+    let (label_w, label_h, right, bottom) = (px(54.0), px(38.0), px(16.0), px(10.0));
+    let mut top = px(10.0);
     if !panel.title.is_empty() {
         area.draw_text(&panel.title, &text(PANEL_TITLE * k, INK), (label_w, top))
             .map_err(draw_error)?;
@@ -134,7 +140,10 @@ where
     }
     top = legend(panel, area, (label_w, top), k)? + px(4.0);
     let (w, h) = area.dim_in_pixel();
-    let plot = (w as i32 - label_w - right, h as i32 - top - label_h);
+    let plot = (
+        w as i32 - label_w - right,
+        h as i32 - top - label_h - bottom,
+    );
     let (x, y) = ranges(panel, f64::from(plot.0) / f64::from(plot.1))?;
     let decimals = |r: &std::ops::Range<f64>| {
         (-((r.end - r.start) / 6.0).log10().floor()).clamp(0.0, 9.0) as usize
@@ -142,6 +151,7 @@ where
     let (x_decimals, y_decimals) = (decimals(&x), decimals(&y));
     let mut axes: Axes<'_, DB> = ChartBuilder::on(area)
         .margin_top(top)
+        .margin_bottom(bottom)
         .margin_right(right)
         .x_label_area_size(label_h)
         .y_label_area_size(label_w)
@@ -192,6 +202,8 @@ where
             (x, y) = (corner.0, y + line_h);
         }
         let line = stroke(one, k);
+        // The middle of a line of text lies below that of its letters.
+        let (middle, y) = (y, y - px(1.0));
         let (a, b) = ((x, y), (x + swatch, y));
         let centre = (x + swatch / 2, y);
         match &one.shape {
@@ -211,7 +223,7 @@ where
             Shape::Rings(_) => area.draw(&Circle::new(centre, px(DOT), line)),
         }
         .map_err(draw_error)?;
-        area.draw_text(&one.label, &style, (x + swatch + px(6.0), y))
+        area.draw_text(&one.label, &style, (x + swatch + px(6.0), middle))
             .map_err(draw_error)?;
         x += swatch + px(22.0) + w as i32;
         drawn = true;

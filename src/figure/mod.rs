@@ -8,6 +8,7 @@ mod theme;
 
 use std::path::{Path, PathBuf};
 
+#[allow(unused_imports, reason = "the palette, whole")]
 pub(crate) use theme::{BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION};
 
 use plotters::style::RGBColor;
@@ -61,6 +62,7 @@ pub(crate) enum Shape {
     Dashed(Vec<(f64, f64)>),
     /// The area between two curves over the same abscissa: (x, low, high).
     Band(Vec<(f64, f64, f64)>),
+    #[allow(dead_code, reason = "for paths; the paper's panels are not in metres")]
     /// Everything within a radius of a path, for equal axes.
     Tube(Vec<(f64, f64)>, f64),
     /// A dot at each point.
@@ -169,6 +171,7 @@ mod tests {
             assert_eq!(std::fs::read(&path).unwrap(), first);
         }
         let svg = std::fs::read_to_string(dir.path().join("a.svg")).unwrap();
+        assert!(svg.starts_with("<svg width=\"916\" height=\"414\" viewBox=\"0 0 7328 3312\""));
         for text in ["A figure", "within 5 cm", "time / s", "received"] {
             assert!(svg.contains(text), "{text}");
         }
