@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 
 use nalgebra::{SMatrix, Vector3};
 use telemime_operator::demonstration::Demonstration;
+use telemime_operator::learn::PredictorOptions;
 use telemime_operator::learn::predictor::{states, train, train_from_labels};
-use telemime_operator::learn::{LearnOptions, PredictorOptions, learn_skill};
 use telemime_protocol::predict::{Forecast, KNOT_SPACING_S, Model, Params};
 
 /// Where the recordings are: `$TELEMIME_DATA`, or `shared` beside the workspace.
@@ -262,84 +262,46 @@ fn report(set: &str, scores: &Scores) {
     }
 }
 
-#[test]
-fn three_waves_predict_the_fourth_as_well_as_the_prototype() {
-    let Some(folder) = needs("data/demos/utd_mhad/a03_wave") else {
+/// Ratios to hold at 100, 200 and 300 ms that the mixture must reach within 5 %, and those of the blend
+/// with the parameters that the training chose.
+fn must_reach(set: &str, mixture: [f64; 3], own: [f64; 3]) {
+    let Some(folder) = needs(&format!("data/demos/{set}")) else {
         return;
     };
     let scores = evaluate(&by_person(&folder), 3);
-    report("a03_wave", &scores);
-    for (knot, prototype) in [(3, 0.403), (6, 0.373), (9, 0.351)] {
-        for name in ["gmr", "blend"] {
+    report(set, &scores);
+    for (name, bar) in [("gmr", mixture), ("own params", own)] {
+        for (knot, bar) in [3, 6, 9].into_iter().zip(bar) {
             let ratio = scores.ratio(name, knot);
             assert!(
-                ratio < 1.05 * prototype,
-                "{name}, knot {knot}: {ratio:.3}, prototype {prototype}"
+                ratio < 1.05 * bar,
+                "{set}, {name}, knot {knot}: {ratio:.3} against {bar}"
             );
         }
     }
 }
 
+/// The figures are those of the numpy prototype, on the same split.
 #[test]
-#[ignore = "a survey over every recording: run by hand, with --release and --nocapture"]
-fn survey() {
-    let Some(root) = needs("data/demos") else {
-        return;
-    };
-    for set in [
-        "utd_mhad/a01_swipe_left",
-        "utd_mhad/a03_wave",
-        "utd_mhad/a09_circle_cw",
-        "utd_mhad/a15_tennis_swing",
-        "kard/a01_horizontal_arm_wave",
-        "robottasks/pouring",
-        "robottasks/openbox",
-        "helloworld/h",
+#[allow(clippy::approx_constant, reason = "0.318 is a measured ratio")]
+fn gestures_are_predicted_as_well_as_by_the_prototype() {
+    for (set, prototype) in [
+        ("utd_mhad/a03_wave", [0.403, 0.373, 0.351]),
+        ("utd_mhad/a01_swipe_left", [0.393, 0.331, 0.285]),
+        ("utd_mhad/a09_circle_cw", [0.332, 0.318, 0.299]),
+        ("utd_mhad/a15_tennis_swing", [0.423, 0.393, 0.372]),
+        ("kard/a01_horizontal_arm_wave", [0.517, 0.504, 0.528]),
     ] {
-        report(set, &evaluate(&by_person(&root.join(set)), 3));
+        must_reach(set, prototype, prototype);
     }
 }
 
+/// Constant velocity beats the mixture here; the parameters chosen on held-out demonstrations must see it.
 #[test]
-#[ignore = "prints what is learned from every set and how long it takes: run by hand, with --release"]
-fn learned() {
-    let Some(root) = needs("data/demos") else {
-        return;
-    };
-    for (set, most) in [
-        ("utd_mhad/a03_wave", 3),
-        ("utd_mhad/a03_wave", 32),
-        ("kard/a01_horizontal_arm_wave", 3),
-        ("kard/a01_horizontal_arm_wave", 30),
-        ("robottasks/pouring", 9),
-        ("helloworld/h", 8),
-    ] {
-        let mut demos: Vec<_> = by_person(&root.join(set)).concat();
-        demos.truncate(most);
-        let start = std::time::Instant::now();
-        let skill = learn_skill("set", &demos, &LearnOptions::default(), |p| {
-            println!("  {p:?}")
-        })
-        .unwrap();
-        println!(
-            "{set} {} demonstrations: {:.2?}, {} bytes, duration {:.2} s, {:?}, novelty90 {:.1}, {:.2?}",
-            demos.len(),
-            start.elapsed(),
-            skill.to_bytes().len(),
-            skill.duration_s(),
-            skill.stats(),
-            skill.predictor().calibration().novelty90,
-            skill.predictor().calibration(),
-        );
-        let state = states(&demos[0]).nth(20).unwrap();
-        let start = std::time::Instant::now();
-        let mut sum = 0.0;
-        for _ in 0..20_000 {
-            let f = skill
-                .predictor()
-                .forecast(std::hint::black_box(&state), &Params::default());
-            sum += f.knots[3].sigma_m;
-        }
-        println!("  forecast: {:?} ({sum:.1})", start.elapsed() / 20_000);
-    }
+fn a_slow_smooth_task_is_not_left_to_the_mixture() {
+    must_reach(
+        "robottasks/pouring",
+        [0.14, 0.16, 0.18],
+        [0.073, 0.10, 0.13],
+    );
 }

@@ -21,8 +21,9 @@ const JOINT: usize = FEATURES + 9;
 /// The knots (from 1) EM sees: 100, 200 and 300 ms.
 const EM_KNOTS: [usize; 3] = [3, 6, 9];
 
-/// Rows nearer in time than this are thinned: a sensor of 200 Hz says nothing more about a hand.
-const LEAST_SPACING_S: f64 = 1.0 / 60.0;
+/// Rows nearer in time than this are thinned: a sensor of 200 Hz says nothing more about a hand than
+/// one of 30, all of whose samples are kept unless they jitter by 8 ms.
+const LEAST_SPACING_S: f64 = 1.0 / 40.0;
 
 const LLOYD_STEPS: usize = 15;
 

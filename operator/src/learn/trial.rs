@@ -1,6 +1,6 @@
 //! What a predictor is worth on motion it has not seen: errors collected, calibration drawn from them.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
 use telemime_protocol::predict::{Calibration, KNOT_SPACING_S, MAX_KNOTS, Model, Params};
 
 use super::predictor::{displacement, states};
@@ -104,7 +104,9 @@ impl Trial {
                 }
                 let truth = displacement(d, i, j);
                 let e = p.displacement[j - 1] - truth;
-                if let Some(c) = p.covariance[j - 1].cholesky() {
+                // A planar motion has no variance across its plane.
+                let covariance = p.covariance[j - 1] + Matrix3::identity() * LEAST_M2;
+                if let Some(c) = covariance.cholesky() {
                     self.nees[j - 1].push(e.dot(&c.solve(&e)));
                 }
                 if CHOSEN_BY.contains(&j) {

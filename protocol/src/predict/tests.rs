@@ -166,6 +166,27 @@ fn a_decoded_model_predicts_to_the_bit_as_the_one_that_was_sent() {
     assert_eq!(a.checksum(), b.checksum());
 }
 
+/// Every bit of a forecast, folded. Both ends may be built differently; they must still get these.
+#[test]
+fn every_build_predicts_the_same_bits() {
+    let skill = example(14, 24);
+    let mut s = HandState::first(Stamp(0), Vector3::new(0.1, 0.2, 0.3));
+    let mut hash = 0xcbf2_9ce4_8422_2325_u64;
+    for i in 1..40_i64 {
+        let u = i as f64;
+        let x = Vector3::new(libm::sin(0.3 * u), libm::cos(0.2 * u), 0.01 * u);
+        assert!(s.advance(Stamp(i * 31_000_000 + i * i * 1000), x));
+        let f = skill.predictor().forecast(&s, &Params::DEFAULT);
+        for knot in &f.knots {
+            for v in knot.displacement.iter().chain([&knot.sigma_m]) {
+                hash = (hash ^ v.to_bits()).wrapping_mul(0x0000_0100_0000_01b3);
+            }
+        }
+    }
+    assert_eq!(format!("{hash:016x}"), "f88b02a561e88262");
+    assert_eq!(skill.id().to_string(), "ae65e7487e96eb304c84dd94aace25f8");
+}
+
 proptest! {
     #[test]
     fn no_finite_hand_gives_nan(path in proptest::collection::vec(

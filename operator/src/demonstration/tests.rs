@@ -1,0 +1,153 @@
+use super::*;
+
+fn lines(rows: &[&str]) -> Result<Demonstration, DemonstrationError> {
+    Demonstration::parse("skill/take.csv", rows.join("\n").as_bytes())
+}
+
+fn good(header: &str, row: impl Fn(usize) -> String) -> Vec<String> {
+    let mut all = vec![header.to_owned()];
+    all.extend((0..10).map(row));
+    all
+}
+
+fn with(line: usize, text: &str) -> Result<Demonstration, DemonstrationError> {
+    let mut rows = good("t,x,y,z", |i| format!("{},{},2,3", i as f64 * 0.1, i));
+    rows[line - 1] = text.to_owned();
+    lines(&rows.iter().map(String::as_str).collect::<Vec<_>>())
+}
+
+#[test]
+fn columns_may_come_in_any_order_with_others_between() {
+    let rows = good("qw, z,t,x,note,y", |i| {
+        format!("1,3,{},{i},hi,2", i as f64 * 0.1)
+    });
+    let d = lines(&rows.iter().map(String::as_str).collect::<Vec<_>>()).unwrap();
+    assert_eq!(d.samples()[4].position, Vector3::new(4.0, 2.0, 3.0));
+    assert_eq!(d.name(), "take");
+    assert_eq!(
+        d.notices()[0].to_string(),
+        "skill/take.csv: columns qw, note ignored"
+    );
+}
+
+#[test]
+fn every_fault_names_file_line_and_remedy() {
+    let cases = [
+        (with(1, "t,x,y"), "skill/take.csv, line 1: no column \"z\""),
+        (
+            with(1, "t,x,y,z,z"),
+            "skill/take.csv, line 1: second column \"z\"",
+        ),
+        (with(4, "0.2,nan,2,3"), "skill/take.csv, line 4: x is NaN"),
+        (with(4, "0.2,1,2,inf"), "skill/take.csv, line 4: z is inf"),
+        (with(4, "0.2,1,2,1e300"), "skill/take.csv, line 4: z is 1"),
+        (
+            with(5, "0.2,1,2,3"),
+            "skill/take.csv, line 5: t = 0.2 s is not after the previous 0.2 s",
+        ),
+        (
+            with(5, "0.1,1,2,3"),
+            "skill/take.csv, line 5: t = 0.1 s is not after",
+        ),
+        (
+            with(6, "0.4,1,2"),
+            "skill/take.csv, line 6: 3 fields where the header has 4",
+        ),
+        (
+            with(6, "0.4,1,2,three"),
+            "skill/take.csv, line 6: z is \"three\", not a number",
+        ),
+        (
+            with(6, "0.4,1,,3"),
+            "skill/take.csv, line 6: y is \"\", not a number",
+        ),
+        (lines(&[]), "skill/take.csv: no samples"),
+        (lines(&["t,x,y,z"]), "skill/take.csv: no samples"),
+        (
+            lines(&["t,x,y,z", "0,1,2,3"]),
+            "skill/take.csv: 1 samples, at least 8",
+        ),
+    ];
+    for (result, expected) in cases {
+        let message = result.unwrap_err().to_string();
+        assert!(
+            message.starts_with(expected),
+            "{message:?} for {expected:?}"
+        );
+        assert!(message.contains("; "), "no remedy in {message:?}");
+    }
+    let binary = Demonstration::parse("a.csv", b"t,x,y,z\n\xff\xfe,1,2,3\n").unwrap_err();
+    assert!(
+        binary.to_string().starts_with("a.csv, line 2: not UTF-8"),
+        "{binary}"
+    );
+}
+
+#[test]
+fn a_folder_is_a_skill() {
+    let root = tempfile::tempdir().unwrap();
+    let dir = root.path().join("wave");
+    assert!(matches!(
+        Demonstrations::read_dir(&dir),
+        Err(DemonstrationError::Io { .. })
+    ));
+    fs::create_dir(&dir).unwrap();
+    fs::write(dir.join("readme.txt"), "not a demonstration").unwrap();
+    assert!(matches!(
+        Demonstrations::read_dir(&dir),
+        Err(DemonstrationError::NoDemonstrations { .. })
+    ));
+    let text = good("t,x,y,z", |i| format!("{i},1,2,3")).join("\n");
+    fs::write(dir.join("b.csv"), &text).unwrap();
+    fs::write(dir.join("a.csv"), &text).unwrap();
+    let skill = Demonstrations::read_dir(&dir).unwrap();
+    assert_eq!(skill.name, "wave");
+    let names: Vec<_> = skill
+        .demonstrations
+        .iter()
+        .map(Demonstration::name)
+        .collect();
+    assert_eq!(names, ["a", "b"]);
+    assert_eq!(
+        skill.demonstrations[0].sha256(),
+        skill.demonstrations[1].sha256()
+    );
+
+    let wider = good("t,x,y,z,qw", |i| format!("{i},1,2,3,1")).join("\n");
+    fs::write(dir.join("c.csv"), wider).unwrap();
+    assert!(matches!(
+        Demonstrations::read_dir(&dir),
+        Err(DemonstrationError::Shape { .. })
+    ));
+}
+
+#[test]
+fn samples_survive_their_csv_to_the_bit() {
+    let samples: Vec<Sample> = (0..9)
+        .map(|i| Sample {
+            t_s: f64::from(i) / 30.0,
+            position: Vector3::new(0.1, -1.0 / 3.0, 1e-9 * f64::from(i)),
+        })
+        .collect();
+    let d = Demonstration::from_samples("made", &samples).unwrap();
+    assert_eq!(d.samples(), samples);
+    let again = Demonstration::parse("made", d.to_csv().as_bytes()).unwrap();
+    assert_eq!(again, d);
+}
+
+#[test]
+fn positions_between_samples_are_linear_and_held_outside() {
+    let d = with(2, "0,0,2,3").unwrap();
+    assert_eq!(d.position_at(-1.0).x, 0.0);
+    assert!((d.position_at(0.25).x - 2.5).abs() < 1e-12);
+    assert_eq!(d.position_at(0.9).x, 9.0);
+    assert_eq!(d.position_at(5.0).x, 9.0);
+}
+
+proptest::proptest! {
+    #[test]
+    fn no_text_makes_the_reader_panic(text in "(t,x,y,z\n)?[0-9.,e\"\n#tnai -]{0,200}", bytes: Vec<u8>) {
+        let _ = Demonstration::parse("a.csv", text.as_bytes());
+        let _ = Demonstration::parse("a.csv", &bytes);
+    }
+}
