@@ -13,8 +13,8 @@ const MEMORY: f64 = 0.9;
 /// The priors weigh as much as this many samples.
 const PRIOR: f64 = 10.0;
 
-/// A priori the straight line errs this many times as much (in squares) as the mixture.
-const PRIOR_RATIO: f64 = 4.0;
+/// Bounds of the mixture's trust before anything was seen: whatever was calibrated can still be outvoted.
+const PRIOR_TRUST: std::ops::RangeInclusive<f64> = 0.05..=0.98;
 
 /// Horizons judged at, s: below, everything is right; above, too few verdicts come in.
 const HORIZON_S: std::ops::RangeInclusive<f64> = 0.05..=0.5;
@@ -29,6 +29,9 @@ struct Pending {
 
 pub(super) struct Adaptation {
     gain: f64,
+    /// A priori the straight line errs this many times as much (in squares) as the mixture.
+    ratio: f64,
+    damping: f64,
     pending: VecDeque<Pending>,
     mixture_error: f64,
     straight_error: f64,
@@ -41,9 +44,14 @@ const UNDAMPED: Params = Params { gain: 1.0, trust: 0.0, cv_damping: 1.0 };
 const MIXTURE: Params = Params { gain: 1.0, trust: 1.0, cv_damping: 0.0 };
 
 impl Adaptation {
-    pub(super) fn new(gain: f64) -> Self {
+    /// Starts from what was calibrated with the skill, or from the defaults.
+    pub(super) fn new(gain: f64, model: Option<&Model>) -> Self {
+        let start = model.map_or(Params::DEFAULT, |model| model.calibration().params);
+        let trust = start.trust.clamp(*PRIOR_TRUST.start(), *PRIOR_TRUST.end());
         Self {
             gain: gain.clamp(0.0, 1.0),
+            ratio: (trust / (1.0 - trust)).sqrt(),
+            damping: start.cv_damping,
             pending: VecDeque::new(),
             mixture_error: 0.0,
             straight_error: 0.0,
@@ -56,13 +64,12 @@ impl Adaptation {
     /// The numbers that travel.
     ///
     /// Trust: weights ∝ (mean squared error)⁻² (prediction.md §3). Damping: the least-squares factor on
-    /// the velocity, drawn to ½ where nothing has moved yet.
+    /// the velocity, drawn to the calibrated one where nothing has moved yet.
     pub(super) fn params(&self) -> Params {
-        let defaults = Params::default();
-        let Some(prior) = self.prior else { return Params { gain: self.gain, ..defaults } };
+        let prior = self.prior.unwrap_or(1.0);
         let mixture = (self.mixture_error + prior).powi(2);
-        let straight = (self.straight_error + PRIOR_RATIO * prior).powi(2);
-        let cv_damping = (self.along + 0.5 * prior) / (self.square + prior);
+        let straight = (self.straight_error + self.ratio * prior).powi(2);
+        let cv_damping = (self.along + self.damping * prior) / (self.square + prior);
         Params { gain: self.gain, trust: straight / (straight + mixture), cv_damping: cv_damping.clamp(0.0, 1.0) }
     }
 

@@ -40,7 +40,12 @@ pub(super) struct Mirror {
 }
 
 impl Mirror {
-    pub(super) fn new(hand: HandState, path_bound_m: f64, gain: f64) -> Result<Self, CheckpointError> {
+    pub(super) fn new(
+        hand: HandState,
+        path_bound_m: f64,
+        gain: f64,
+        skill: Option<&Skill>,
+    ) -> Result<Self, CheckpointError> {
         // The bound both ends derive their grid from is a whole number of µm.
         let path_bound_m = (path_bound_m * 1e6).round() * 1e-6;
         Ok(Self {
@@ -48,7 +53,7 @@ impl Mirror {
             path: PathEncoder::new(path_bound_m)?,
             unacknowledged: VecDeque::new(),
             first_unacknowledged: 0,
-            adaptation: Adaptation::new(gain),
+            adaptation: Adaptation::new(gain, skill.map(Skill::predictor)),
             without_model: false,
             newest: None,
             sent: None,

@@ -331,11 +331,12 @@ impl Session {
             self.events.push_back(Event::Refused(Refusal::StaleReference));
             return;
         };
-        let Ok(mirror) = Mirror::new(hand, self.path_bound_m(), self.config.gain) else {
+        let skill = self.skill.as_deref().filter(|_| self.model_stored);
+        let Ok(mirror) = Mirror::new(hand, self.path_bound_m(), self.config.gain, skill) else {
             self.events.push_back(Event::Refused(Refusal::BadMapping));
             return;
         };
-        let Some((state, model, params)) = mirror.reference(self.skill.as_deref().filter(|_| self.model_stored))
+        let Some((state, model, params)) = mirror.reference(skill)
         else {
             self.events.push_back(Event::Refused(Refusal::StaleReference));
             return;
