@@ -1,4 +1,5 @@
-//! Everything that stands in for the physical world: an arm built from its URDF and an operator's hand.
+//! Stand-ins for the physical world: an arm, a hand, a link. Nothing here knows of daemons or sockets.
 
 pub mod arm;
 pub mod hand;
+pub mod link;

@@ -1,0 +1,180 @@
+//! From demonstrations to a [`Skill`]: alignment, the motion's mixture, the predictor, both calibrated.
+
+pub mod align;
+pub mod em;
+pub mod kmeans;
+pub mod motion;
+pub mod predictor;
+pub mod select;
+mod stats;
+#[cfg(test)]
+mod tests;
+mod trial;
+
+use telemime_protocol::predict::ModelError;
+use telemime_protocol::skill::{Gmm, Provenance, Skill, SkillError, Source};
+
+use crate::demonstration::Demonstration;
+
+pub use predictor::PredictorOptions;
+pub use stats::statistics;
+
+/// Why nothing could be learned.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum LearnError {
+    /// No demonstration was given.
+    #[error("no demonstrations: at least one is needed, three or more are better")]
+    NoDemonstrations,
+    /// K is zero or beyond what a mixture may have.
+    #[error("{asked} mixture components asked for, 1 to 64 are possible")]
+    Components {
+        /// K.
+        asked: usize,
+    },
+    /// Fewer rows than a mixture needs.
+    #[error("{found} rows of data, at least {needed} are needed")]
+    TooFewRows {
+        /// Rows.
+        found: usize,
+        /// Rows needed.
+        needed: usize,
+    },
+    /// A row is not finite, or so large that squares could overflow.
+    #[error("row {row} of the data is not finite or beyond 1e12")]
+    OutOfRange {
+        /// Its index.
+        row: usize,
+    },
+    /// The data span no volume, and no ridge was allowed.
+    #[error("the data lie in a subspace: no mixture of full covariance fits without a ridge")]
+    Singular,
+    /// The trained predictor is not valid.
+    #[error(transparent)]
+    Predictor(#[from] ModelError),
+    /// The learned numbers make no valid skill, for example because of its name.
+    #[error(transparent)]
+    Skill(#[from] SkillError),
+}
+
+/// How to learn a skill.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LearnOptions {
+    /// The motion's mixture: number of components to choose from by BIC.
+    pub motion_components: std::ops::RangeInclusive<usize>,
+    /// The predictor.
+    pub predictor: PredictorOptions,
+    /// Seed of every random choice.
+    pub seed: u64,
+}
+
+impl Default for LearnOptions {
+    fn default() -> Self {
+        Self {
+            motion_components: 2..=20,
+            predictor: PredictorOptions::default(),
+            seed: 0,
+        }
+    }
+}
+
+/// How far learning has come, and what it found on the way.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Progress {
+    /// The demonstrations lie on one time axis.
+    Aligned {
+        /// The name of the medoid.
+        medoid: String,
+        /// Mean duration, s.
+        duration_s: f64,
+    },
+    /// A number of components was tried for the motion.
+    Candidate(select::Candidate),
+    /// The motion's mixture is chosen.
+    Motion {
+        /// Components.
+        components: usize,
+        /// Mean log likelihood, nats a sample (s, m).
+        score: f64,
+        /// Components that died and were started again or removed.
+        degenerate: Vec<em::Degenerate>,
+    },
+    /// A predictor was trained without one demonstration and tried on it.
+    Held {
+        /// How many are done.
+        done: usize,
+        /// Of how many.
+        of: usize,
+    },
+    /// The predictor is trained.
+    Predictor {
+        /// Components.
+        components: usize,
+        /// Samples it was trained on.
+        samples: usize,
+    },
+}
+
+/// Learns a skill from the demonstrations of it.
+///
+/// The result is already in the form that its encoding gives it: what is learned is what runs.
+///
+/// # Errors
+/// [`LearnError`], one variant a cause.
+pub fn learn_skill(
+    name: &str,
+    demonstrations: &[Demonstration],
+    options: &LearnOptions,
+    mut progress: impl FnMut(Progress),
+) -> Result<Skill, LearnError> {
+    let aligned = align::align(demonstrations)?;
+    progress(Progress::Aligned {
+        medoid: demonstrations[aligned.medoid].name().to_owned(),
+        duration_s: aligned.duration_s,
+    });
+    let motion = motion::fit(&aligned, options, &mut progress)?;
+    let predictor = predictor::train(
+        demonstrations,
+        &options.predictor,
+        options.seed,
+        &mut progress,
+    )?;
+    assemble(
+        name,
+        demonstrations,
+        &motion,
+        aligned.duration_s,
+        &predictor,
+        options.seed,
+    )
+}
+
+fn assemble(
+    name: &str,
+    demonstrations: &[Demonstration],
+    motion: &Gmm<4>,
+    duration_s: f64,
+    predictor: &telemime_protocol::predict::Model,
+    seed: u64,
+) -> Result<Skill, LearnError> {
+    let sources = demonstrations
+        .iter()
+        .map(|d| Source {
+            name: d.name().to_owned(),
+            sha256: *d.sha256(),
+        })
+        .collect();
+    let provenance = Provenance {
+        producer: concat!("telemime ", env!("CARGO_PKG_VERSION")).to_owned(),
+        seed,
+        sources,
+    };
+    let stats = statistics(demonstrations);
+    Ok(Skill::new(
+        name.to_owned(),
+        motion,
+        duration_s,
+        predictor,
+        stats,
+        provenance,
+    )?)
+}

@@ -1,0 +1,224 @@
+use super::*;
+use proptest::prelude::*;
+
+/// Encodes, decodes every knot, and returns the decoder with the knots.
+fn run(bound_m: f64, samples: &[(Stamp, Vector3<f64>)]) -> (PathDecoder, Vec<PathKnot>) {
+    let mut encoder = PathEncoder::new(bound_m).unwrap();
+    let mut decoder = PathDecoder::new(encoder.grid(), samples.len() + 2);
+    let mut knots = Vec::new();
+    for (t, x) in samples {
+        if let Some(k) = encoder.push(*t, *x).unwrap() {
+            decoder.append(&k).unwrap();
+            knots.push(k);
+        }
+    }
+    if let Some(k) = encoder.flush() {
+        decoder.append(&k).unwrap();
+        knots.push(k);
+    }
+    assert_eq!(encoder.flush(), None);
+    (decoder, knots)
+}
+
+fn on_tick(t: Stamp) -> Stamp {
+    Stamp(tick_of(t) * TICK_NS)
+}
+
+fn worst(decoder: &PathDecoder, samples: &[(Stamp, Vector3<f64>)]) -> f64 {
+    samples
+        .iter()
+        .map(|(t, x)| (decoder.eval(on_tick(*t)).expect("covered").x - x).norm())
+        .fold(0.0, f64::max)
+}
+
+fn swing(rate_hz: f64, duration_s: f64) -> Vec<(Stamp, Vector3<f64>)> {
+    (0..(rate_hz * duration_s) as i64)
+        .map(|i| {
+            let t = i as f64 / rate_hz;
+            let w = 5.0 * t;
+            let x = Vector3::new(
+                0.4 * libm::sin(w),
+                0.2 * libm::cos(w),
+                0.1 * libm::sin(2.0 * w),
+            );
+            (Stamp::from_secs_f64(t), x)
+        })
+        .collect()
+}
+
+#[test]
+fn a_smooth_swing_needs_few_knots() {
+    for (bound_m, most) in [(0.005, 35), (0.02, 28)] {
+        let samples = swing(100.0, 10.0);
+        let (decoder, knots) = run(bound_m, &samples);
+        assert!(worst(&decoder, &samples) <= bound_m);
+        assert!(knots.len() <= most, "{} knots at {bound_m} m", knots.len());
+    }
+}
+
+#[test]
+fn a_hole_is_a_hole() {
+    let mut samples = swing(50.0, 4.0);
+    samples.retain(|(t, _)| !(1.0..2.0).contains(&t.as_secs_f64()));
+    // Alone between two holes.
+    samples.retain(|(t, _)| t.as_secs_f64() < 2.5 || t.as_secs_f64() > 3.5);
+    samples.push((Stamp::from_secs_f64(5.0), Vector3::repeat(0.1)));
+    samples.push((Stamp::from_secs_f64(6.0), Vector3::repeat(0.1)));
+    let (decoder, knots) = run(0.01, &samples);
+    assert!(worst(&decoder, &samples) <= 0.01);
+    assert_eq!(knots.iter().filter(|k| k.start).count(), 5);
+    for t_s in [1.5, 3.0, 4.5, 5.5] {
+        assert_eq!(decoder.eval(Stamp::from_secs_f64(t_s)), None);
+    }
+    assert_eq!(decoder.eval(Stamp(-1)), None);
+    assert_eq!(decoder.eval(Stamp::from_secs_f64(6.1)), None);
+}
+
+#[test]
+fn the_past_never_changes_and_memory_is_bounded() {
+    let samples = swing(100.0, 20.0);
+    let (all, knots) = run(0.005, &samples);
+    let mut decoder = PathDecoder::new(PathGrid::for_bound(0.005).unwrap(), 8);
+    let probe = Stamp(knots[2].tick * TICK_NS + 7);
+    let mut seen = None;
+    for k in &knots {
+        decoder.append(k).unwrap();
+        assert!(decoder.knots().len() <= 8);
+        if let Some(jet) = decoder.eval(probe) {
+            assert_eq!(*seen.get_or_insert(jet), jet);
+        }
+    }
+    assert_eq!(seen, all.eval(probe));
+    assert_eq!(decoder.eval(probe), None);
+    assert_eq!(decoder.frontier(), all.frontier());
+}
+
+#[test]
+fn what_cannot_be_is_refused_and_the_path_goes_on() {
+    let mut e = PathEncoder::new(0.01).unwrap();
+    let o = Vector3::zeros();
+    e.push(Stamp(0), o).unwrap();
+    assert_eq!(
+        e.push(Stamp(4_000), o),
+        Err(PathError::Unordered { tick: 0, newest: 0 })
+    );
+    assert_eq!(
+        e.push(Stamp(1 << 30), o * f64::NAN),
+        Err(PathError::NonFinite)
+    );
+    assert_eq!(
+        e.push(Stamp(1 << 30), o.add_scalar(1e12)),
+        Err(PathError::OutOfRange)
+    );
+    assert!(e.push(Stamp(20_000_000), o).unwrap().is_some());
+
+    let grid = e.grid();
+    let knot = |tick, start| PathKnot {
+        tick,
+        x: [0; 3],
+        v: [0; 3],
+        start,
+    };
+    let mut d = PathDecoder::new(grid, 16);
+    assert_eq!(
+        d.append(&knot(0, false)),
+        Err(PathError::Disconnected { gap_ticks: 0 })
+    );
+    d.append(&knot(0, true)).unwrap();
+    assert_eq!(
+        d.append(&knot(100_001, false)),
+        Err(PathError::Disconnected { gap_ticks: 100_001 })
+    );
+    assert!(matches!(
+        d.append(&knot(0, false)),
+        Err(PathError::Unordered { .. })
+    ));
+    assert_eq!(d.append(&knot(i64::MAX, true)), Err(PathError::OutOfRange));
+    let far = PathKnot {
+        x: [i32::MIN, 0, 0],
+        ..knot(5, false)
+    };
+    assert_eq!(d.append(&far), Err(PathError::OutOfRange));
+    d.append(&knot(100_000, false)).unwrap();
+    assert!(PathEncoder::new(0.0).is_err());
+}
+
+#[test]
+fn extreme_stamps_do_not_overflow() {
+    let mut e = PathEncoder::new(0.01).unwrap();
+    for ns in [i64::MIN, -1, 0, i64::MAX] {
+        let _ = e.push(Stamp(ns), Vector3::zeros());
+    }
+    let _ = e.flush();
+}
+
+/// Random walks, jumps, stillness and jitter, at intervals from one tick to a long hole.
+fn signal() -> impl Strategy<Value = Vec<(Stamp, Vector3<f64>)>> {
+    let interval = prop_oneof![
+        4 => 15_000_000..50_000_000i64,
+        2 => 10_000..5_000_000i64,
+        1 => 300_000_000..900_000_000i64,
+    ];
+    let step = prop_oneof![
+        4 => prop::array::uniform3(-0.02..0.02f64),
+        2 => Just([0.0; 3]),
+        1 => prop::array::uniform3(-2.0..2.0f64),
+    ];
+    prop::collection::vec((interval, step), 1..250).prop_map(|steps| {
+        let (mut t, mut x) = (Stamp(-1_000_000_000), Vector3::zeros());
+        steps
+            .into_iter()
+            .map(|(dt, dx)| {
+                t = Stamp(t.0 + dt);
+                x += Vector3::from(dx);
+                (t, x)
+            })
+            .collect()
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 200, ..ProptestConfig::default() })]
+
+    #[test]
+    fn the_bound_holds_at_every_sample(samples in signal(), bound_m in 1e-4..0.1f64) {
+        let (decoder, knots) = run(bound_m, &samples);
+        prop_assert!(worst(&decoder, &samples) <= bound_m);
+        for pair in knots.windows(2) {
+            let gap_s = (pair[1].tick - pair[0].tick) as f64 * TICK_NS as f64 * 1e-9;
+            prop_assert!(pair[1].start || gap_s <= MAX_SPAN_S);
+        }
+    }
+
+    #[test]
+    fn quantising_twice_changes_nothing(samples in signal(), bound_m in 1e-4..0.1f64) {
+        let (_, knots) = run(bound_m, &samples);
+        let grid = PathGrid::for_bound(bound_m).unwrap();
+        for k in knots {
+            let d = grid.dequantise(&k).unwrap();
+            prop_assert_eq!(grid.quantise(d.t, &d.x, &d.v, k.start).unwrap(), k);
+        }
+    }
+
+    /// Flushing at arbitrary moments closes the path early but never breaks it.
+    #[test]
+    fn the_bound_survives_flushes(samples in signal(), every in 1usize..20) {
+        let mut encoder = PathEncoder::new(0.01).unwrap();
+        let mut decoder = PathDecoder::new(encoder.grid(), samples.len() + 2);
+        for (i, (t, x)) in samples.iter().enumerate() {
+            if let Some(k) = encoder.push(*t, *x).unwrap() {
+                decoder.append(&k).unwrap();
+            }
+            if i % every == 0 {
+                if let Some(k) = encoder.flush() {
+                    decoder.append(&k).unwrap();
+                }
+                prop_assert_eq!(decoder.frontier(), Some(on_tick(*t)));
+            }
+        }
+        if let Some(k) = encoder.flush() {
+            decoder.append(&k).unwrap();
+        }
+        prop_assert!(worst(&decoder, &samples) <= 0.01);
+    }
+}

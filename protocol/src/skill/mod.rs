@@ -1,0 +1,210 @@
+//! What a skill is: a motion to play, a predictor to mirror with, and where both came from.
+
+mod bytes;
+mod file;
+pub(crate) mod gmm;
+mod gmr;
+
+use core::fmt;
+
+use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::predict::{Model, ModelError};
+use crate::wire::codec::DecodeError;
+
+pub use file::FileError;
+pub use gmm::{Component, Gmm, GmmError, MAX_COMPONENTS};
+pub use gmr::{Gmr, GmrError, Regressed};
+
+/// The most bytes an encoded skill may have.
+pub const MAX_SKILL_BYTES: usize = 512 * 1024;
+
+/// The most bytes a skill's name may have.
+pub const MAX_NAME_BYTES: usize = 64;
+
+/// The most demonstrations a skill may name as its origin.
+pub const MAX_SOURCES: usize = 256;
+
+/// Which skill: the first 16 bytes of the SHA-256 of its encoding.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct SkillId(pub [u8; 16]);
+
+impl fmt::Display for SkillId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.iter().try_for_each(|b| write!(f, "{b:02x}"))
+    }
+}
+
+impl fmt::Debug for SkillId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "SkillId({self})")
+    }
+}
+
+/// How the demonstrations moved, in SI units: what a mapping onto an arm needs.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Stats {
+    /// 95 % quantile of the speed, m/s.
+    pub speed95_m_s: f64,
+    /// 95 % quantile of the acceleration, m/s².
+    pub acceleration95_m_s2: f64,
+    /// The farthest any demonstration gets from its own first position, m.
+    pub reach_m: f64,
+    /// Lower corner of the box around all positions, m.
+    pub min: Vector3<f64>,
+    /// Upper corner of the box around all positions, m.
+    pub max: Vector3<f64>,
+}
+
+/// One demonstration a skill was learned from.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Source {
+    /// The demonstration's name.
+    pub name: String,
+    /// SHA-256 of the file's bytes: what was trained on is never replayed as if unseen.
+    pub sha256: [u8; 32],
+}
+
+/// Where a skill came from, so that it can be learned again to the byte.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Provenance {
+    /// The program that learned it, and its version.
+    pub producer: String,
+    /// Seed of every random choice in learning.
+    pub seed: u64,
+    /// The demonstrations, in the order they were used.
+    pub sources: Vec<Source>,
+}
+
+/// Why numbers are not a skill.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SkillError {
+    /// The bytes are not an encoding, or not a canonical one.
+    #[error(transparent)]
+    Decode(#[from] DecodeError),
+    /// The motion is not a mixture.
+    #[error("motion: {0}")]
+    Motion(#[from] GmmError),
+    /// The predictor is not one.
+    #[error(transparent)]
+    Predictor(#[from] ModelError),
+    /// The name is empty or too long.
+    #[error("a name of {bytes} bytes, 1 to {MAX_NAME_BYTES} are allowed")]
+    Name {
+        /// Its length.
+        bytes: usize,
+    },
+    /// The duration is not a positive number.
+    #[error("a duration of {seconds} s")]
+    Duration {
+        /// The duration, s.
+        seconds: f64,
+    },
+    /// A statistic of the demonstrations is negative, not finite or contradicts another.
+    #[error("statistics: {field} is not usable")]
+    Stats {
+        /// Which.
+        field: &'static str,
+    },
+    /// The provenance is longer than allowed.
+    #[error("provenance: {field} is too long")]
+    Provenance {
+        /// Which.
+        field: &'static str,
+    },
+}
+
+/// A learned skill. It exists only in the form its encoding gives it: a predictor's numbers are
+/// rounded to `f32` on construction, so that whoever learned it runs what everybody else runs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Skill {
+    name: String,
+    motion: Gmm<4>,
+    duration_s: f64,
+    predictor: Model,
+    stats: Stats,
+    provenance: Provenance,
+    id: SkillId,
+    bytes: Vec<u8>,
+}
+
+impl Skill {
+    /// Checks, encodes and decodes a skill. `motion` is over (t s, x m, y m, z m), t from 0 to `duration_s`.
+    ///
+    /// # Errors
+    /// [`SkillError`], one variant a cause.
+    pub fn new(
+        name: String,
+        motion: &Gmm<4>,
+        duration_s: f64,
+        predictor: &Model,
+        stats: Stats,
+        provenance: Provenance,
+    ) -> Result<Self, SkillError> {
+        Self::from_bytes(&bytes::encode(
+            name, motion, duration_s, predictor, stats, provenance,
+        ))
+    }
+
+    /// Decodes and checks a skill of at most [`MAX_SKILL_BYTES`].
+    ///
+    /// # Errors
+    /// [`SkillError`], one variant a cause.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, SkillError> {
+        bytes::decode(bytes)
+    }
+
+    /// The canonical encoding; [`Skill::from_bytes`] of it is this skill.
+    pub fn to_bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+
+    /// Which skill this is: a hash of its encoding.
+    pub fn id(&self) -> SkillId {
+        self.id
+    }
+
+    /// Its name, 1 to [`MAX_NAME_BYTES`] bytes.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The motion to play: a mixture over (t s, x m, y m, z m).
+    pub fn motion(&self) -> &Gmm<4> {
+        &self.motion
+    }
+
+    /// How long the motion takes, s.
+    pub fn duration_s(&self) -> f64 {
+        self.duration_s
+    }
+
+    /// The predictor to mirror with.
+    pub fn predictor(&self) -> &Model {
+        &self.predictor
+    }
+
+    /// How the demonstrations moved.
+    pub fn stats(&self) -> &Stats {
+        &self.stats
+    }
+
+    /// Where the skill came from.
+    pub fn provenance(&self) -> &Provenance {
+        &self.provenance
+    }
+
+    /// Whether a recording with this SHA-256 was trained on.
+    pub fn was_trained_on(&self, sha256: &[u8; 32]) -> bool {
+        self.provenance.sources.iter().any(|s| s.sha256 == *sha256)
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests;
+
+fn sha256(bytes: &[u8]) -> [u8; 32] {
+    Sha256::digest(bytes).into()
+}

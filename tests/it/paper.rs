@@ -1,0 +1,122 @@
+//! `telemime paper` as a user runs it.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+fn paper(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_telemime"))
+        .arg("paper")
+        .args(args)
+        .output()
+        .expect("the built binary runs")
+}
+
+/// The one JSON object on stdout.
+fn tasks(output: &Output) -> Vec<Value> {
+    assert!(output.status.success(), "{output:?}");
+    let object: Value = serde_json::from_slice(&output.stdout).expect("exactly one JSON object");
+    object["tasks"].as_array().expect("tasks").clone()
+}
+
+fn r2(block: &Value) -> [f64; 2] {
+    serde_json::from_value(block["r2"].clone()).expect("two numbers")
+}
+
+/// The publication's series, or `None` (said aloud) where the shared data are absent.
+fn series() -> Option<PathBuf> {
+    let data = std::env::var_os("TELEMIME_DATA").map_or_else(
+        || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"),
+        PathBuf::from,
+    );
+    let dir = data.join("data/paper");
+    if dir.is_dir() {
+        return Some(dir);
+    }
+    eprintln!("SKIPPED: no {}; set TELEMIME_DATA", dir.display());
+    None
+}
+
+#[test]
+fn its_series_give_its_tables_to_three_decimals() {
+    let Some(dir) = series() else { return };
+    let tasks = tasks(&paper(&[
+        "--json",
+        "--series",
+        dir.to_str().expect("UTF-8"),
+    ]));
+    let [task] = tasks.as_slice() else {
+        panic!("one task, not {}", tasks.len())
+    };
+    assert_eq!(task["name"], "series");
+    let reproduced = &task["reproduced"];
+    assert_eq!(reproduced["checkpoints"], 14);
+    for (table, printed) in [("encoder", [0.625, 0.736]), ("overall", [0.625, 0.722])] {
+        let r2 = r2(&reproduced[table]);
+        for d in 0..2 {
+            assert!(
+                (r2[d] - printed[d]).abs() < 0.0005,
+                "{table}: {r2:?} for {printed:?}"
+            );
+        }
+    }
+    // Ours: fewer points and a bound in time, and better than as many at even distances.
+    let ours = &task["ours"];
+    assert!(ours["checkpoints"].as_u64() < Some(14));
+    assert!(r2(&ours["encoder"])[1] > 0.9999);
+    let uniform = &task["baselines"]["uniform_in_time"];
+    assert_eq!(uniform["checkpoints"], ours["checkpoints"]);
+    assert!(r2(&uniform["encoder"])[1] < r2(&ours["encoder"])[1]);
+}
+
+#[test]
+fn from_the_formulas_with_a_figure() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let figure = dir.path().join("paper.svg");
+    let output = paper(&["--json", "--figure", figure.to_str().expect("UTF-8")]);
+    let tasks = tasks(&output);
+    let names: Vec<_> = tasks.iter().map(|t| t["name"].clone()).collect();
+    assert_eq!(names, ["task1", "task2"]);
+    assert!(tasks[0]["published"].is_object() && tasks[1]["published"].is_null());
+    for task in &tasks {
+        for pipeline in ["reproduced", "ours"] {
+            for block in ["learning", "encoder", "overall"] {
+                for measure in ["mae", "mse", "r2"] {
+                    let values = task[pipeline][block][measure].as_array();
+                    assert_eq!(
+                        values.map(Vec::len),
+                        Some(2),
+                        "{pipeline} {block} {measure}"
+                    );
+                }
+            }
+        }
+        assert!(r2(&task["ours"]["encoder"]).iter().all(|r2| *r2 > 0.9999));
+    }
+    // Plain EM on task 1: 0.9906 with three components, 0.9971 with the seven that BIC chooses.
+    assert!((r2(&tasks[0]["reproduced"]["learning"])[1] - 0.9906).abs() < 1e-4);
+    assert!((r2(&tasks[0]["ours"]["learning"])[1] - 0.9971).abs() < 1e-4);
+    let told = String::from_utf8(output.stderr).expect("UTF-8");
+    assert!(told.contains("variational mixture"), "{told}");
+    let svg = std::fs::read_to_string(figure).expect("the figure");
+    assert!(svg.contains("task 2: x\u{2082} over time"));
+}
+
+#[test]
+fn bad_input_is_one_line_and_no_figure() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let path = dir.path().to_str().expect("UTF-8");
+    let figure = dir.path().join("never.png");
+    let output = paper(&[
+        "--series",
+        path,
+        "--figure",
+        figure.to_str().expect("UTF-8"),
+    ]);
+    assert!(!output.status.success() && output.stdout.is_empty());
+    let told = String::from_utf8(output.stderr).expect("UTF-8");
+    assert_eq!(told.lines().count(), 1, "{told}");
+    assert!(told.contains("ground_truth.csv"), "{told}");
+    assert!(!figure.exists());
+}

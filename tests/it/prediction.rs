@@ -1,0 +1,345 @@
+//! The predictor on real hands: against the reference answer, and against holding the last sample.
+//!
+//! The recordings are public but not ours to ship: without them these tests say that they are skipped.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use nalgebra::{SMatrix, Vector3};
+use telemime_operator::demonstration::Demonstration;
+use telemime_operator::learn::predictor::{states, train, train_from_labels};
+use telemime_operator::learn::{LearnOptions, PredictorOptions, learn_skill};
+use telemime_protocol::predict::{Forecast, KNOT_SPACING_S, Model, Params};
+
+/// Where the recordings are: `$TELEMIME_DATA`, or `shared` beside the workspace.
+fn data() -> PathBuf {
+    std::env::var_os("TELEMIME_DATA").map_or_else(
+        || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"),
+        PathBuf::from,
+    )
+}
+
+/// The path below [`data`], or a loud note that the test proves nothing without it.
+fn needs(relative: &str) -> Option<PathBuf> {
+    let path = data().join(relative);
+    if path.exists() {
+        return Some(path);
+    }
+    eprintln!(
+        "SKIPPED: {} is not there; set TELEMIME_DATA",
+        path.display()
+    );
+    None
+}
+
+fn array<const N: usize>(v: &serde_json::Value) -> [f64; N] {
+    let v = v.as_array().unwrap();
+    assert_eq!(v.len(), N);
+    std::array::from_fn(|i| v[i].as_f64().unwrap())
+}
+
+/// The largest difference between two sequences, against `scale`.
+fn gap(a: impl IntoIterator<Item = f64>, b: impl IntoIterator<Item = f64>, scale: f64) -> f64 {
+    let mut b = b.into_iter();
+    let worst = a
+        .into_iter()
+        .map(|a| (a - b.next().unwrap()).abs() / scale)
+        .fold(0.0, f64::max);
+    assert!(b.next().is_none());
+    worst
+}
+
+#[test]
+fn the_reference_answer_is_reproduced() {
+    let Some(path) = needs("vectors/predictor_wave.json") else {
+        return;
+    };
+    let v: serde_json::Value = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
+    let read = |name: &serde_json::Value| {
+        Demonstration::read_csv(data().join(name.as_str().unwrap())).unwrap()
+    };
+    let demos: Vec<_> = v["train"].as_array().unwrap().iter().map(read).collect();
+    let labels: Vec<usize> = v["labels"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|l| l.as_u64().unwrap() as usize)
+        .collect();
+    let options = PredictorOptions {
+        knots: 9,
+        ..PredictorOptions::default()
+    };
+    let model = train_from_labels(&demos, &labels, &options).unwrap();
+
+    let (ym, ys) = (array::<27>(&v["ym"]), array::<27>(&v["ys"]));
+    let standard = model.standardisation();
+    assert!(gap(standard.mean.iter().copied(), array::<15>(&v["fm"]), 1.0) < 1e-9);
+    assert!(gap(standard.scale.iter().copied(), array::<15>(&v["fs"]), 1.0) < 1e-9);
+    assert_eq!(model.components().len(), 14);
+    let mut worst = 0.0_f64;
+    for (k, c) in model.components().iter().enumerate() {
+        worst = worst.max((c.weight - v["pi"][k].as_f64().unwrap()).abs());
+        worst = worst.max(gap(c.mean.iter().copied(), array::<15>(&v["muf"][k]), 1.0));
+        let muy = array::<27>(&v["muy"][k]);
+        let target = (0..27).map(|j| (c.target[j] - ym[j]) / ys[j]);
+        worst = worst.max(gap(target, muy, 1.0));
+        let l = SMatrix::<f64, 15, 15>::from_fn(|i, j| v["l"][k][i][j].as_f64().unwrap());
+        worst = worst.max((c.factor - l).abs().max());
+        for i in 0..15 {
+            let b = array::<27>(&v["b"][k][i]);
+            worst = worst.max(gap((0..27).map(|j| c.gain[i][j] / ys[j]), b, 1.0));
+        }
+        for j in 0..9 {
+            let block: Vec<[f64; 3]> = (0..3).map(|r| array(&v["v"][k][j][r])).collect();
+            let upper = [
+                block[0][0],
+                block[0][1],
+                block[0][2],
+                block[1][1],
+                block[1][2],
+                block[2][2],
+            ];
+            let scale = ys[3 * j] * ys[3 * j];
+            worst = worst.max(gap(c.residual[j], upper, scale));
+        }
+    }
+    println!("parameters: largest difference {worst:.1e} (standardised)");
+    assert!(worst < 1e-6, "{worst:e}");
+
+    let test = read(&v["test"]);
+    let exact = worst_query(&model, &test, &v);
+    println!(
+        "queries, f64: displacement {:.1e} m, trace {:.1e}, novelty {:.1e}",
+        exact.0, exact.1, exact.2
+    );
+    assert!(
+        exact.0 < 1e-6 && exact.1 < 1e-6 && exact.2 < 1e-6,
+        "{exact:?}"
+    );
+
+    let rounded = rounded(&model);
+    let after = worst_query(&rounded, &test, &v);
+    println!(
+        "queries, f32 parameters: displacement {:.1e} m, trace {:.1e}, novelty {:.1e}",
+        after.0, after.1, after.2
+    );
+    assert!(
+        after.0 < 1e-6 && after.1 < 1e-5 && after.2 < 1e-5,
+        "{after:?}"
+    );
+}
+
+/// Largest difference from the reference over all queries: displacement (m), trace and novelty (relative).
+fn worst_query(model: &Model, test: &Demonstration, v: &serde_json::Value) -> (f64, f64, f64) {
+    let mut worst = (0.0_f64, 0.0_f64, 0.0_f64);
+    for (i, state) in states(test).enumerate() {
+        let expected = array::<15>(&v["features"][i]);
+        assert!(gap(state.features().iter().copied(), expected, 1.0) < 1e-9);
+        let p = model.posterior(&state);
+        for j in 0..9 {
+            let d = Vector3::from(array::<3>(&v["displacement_m"][i][j]));
+            worst.0 = worst.0.max((p.displacement[j] - d).norm());
+            let trace = v["covariance_trace_m2"][i][j].as_f64().unwrap();
+            worst.1 = worst.1.max((p.covariance[j].trace() / trace - 1.0).abs());
+        }
+        let novelty = v["novelty"][i].as_f64().unwrap();
+        worst.2 = worst.2.max((p.novelty / novelty - 1.0).abs());
+    }
+    worst
+}
+
+/// The model as it is after its parameters were rounded to `f32`, which is how it travels.
+fn rounded(model: &Model) -> Model {
+    let narrow = |v: f64| f64::from(v as f32);
+    let mut standardisation = model.standardisation().clone();
+    standardisation.mean.apply(|v| *v = narrow(*v));
+    standardisation.scale.apply(|v| *v = narrow(*v));
+    let mut components = model.components().to_vec();
+    for c in &mut components {
+        c.weight = narrow(c.weight);
+        c.mean.apply(|v| *v = narrow(*v));
+        c.factor.apply(|v| *v = narrow(*v));
+        let all = c.target.iter_mut().chain(c.gain.as_flattened_mut());
+        all.chain(c.residual.as_flattened_mut())
+            .for_each(|v| *v = narrow(*v));
+    }
+    Model::new(
+        model.knots(),
+        standardisation,
+        components,
+        *model.calibration(),
+    )
+    .unwrap()
+}
+
+/// Squared errors of several predictors at every knot.
+#[derive(Default)]
+struct Scores {
+    squared: BTreeMap<&'static str, Vec<f64>>,
+}
+
+impl Scores {
+    fn add(&mut self, name: &'static str, knot: usize, error: Vector3<f64>) {
+        let sums = self.squared.entry(name).or_insert_with(|| vec![0.0; 24]);
+        sums[knot - 1] += error.norm_squared();
+    }
+
+    fn ratio(&self, name: &str, knot: usize) -> f64 {
+        (self.squared[name][knot - 1] / self.squared["hold"][knot - 1]).sqrt()
+    }
+}
+
+/// Demonstrations of one folder, by who performed them: `<action>_<person>_<trial>.csv`, else one group.
+fn by_person(folder: &Path) -> Vec<Vec<Demonstration>> {
+    let mut groups = BTreeMap::<String, Vec<Demonstration>>::new();
+    let mut paths: Vec<_> = std::fs::read_dir(folder)
+        .unwrap()
+        .map(|e| e.unwrap().path())
+        .collect();
+    paths.sort();
+    for path in paths {
+        let stem = path.file_stem().unwrap().to_string_lossy().into_owned();
+        let person = stem.rsplit_once('_').map_or("", |(p, _)| p).to_owned();
+        let demo = Demonstration::read_csv(&path).unwrap();
+        groups.entry(person).or_default().push(demo);
+    }
+    groups.into_values().collect()
+}
+
+/// Leaves out each performance of a group in turn, trains on (at most `most` of) the others.
+fn evaluate(groups: &[Vec<Demonstration>], most: usize) -> Scores {
+    let mut scores = Scores::default();
+    for group in groups {
+        for (held, test) in group.iter().enumerate() {
+            let mut others = group.clone();
+            others.remove(held);
+            others.truncate(most);
+            if others.is_empty() {
+                continue;
+            }
+            let model = train(&others, &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
+            score(&model, test, &mut scores);
+        }
+    }
+    scores
+}
+
+fn score(model: &Model, test: &Demonstration, scores: &mut Scores) {
+    let end_s = test.last().t_s + 1e-9;
+    let undamped = Params {
+        cv_damping: 1.0,
+        ..Params::default()
+    };
+    for (sample, state) in test.samples().iter().zip(states(test)) {
+        let mixture = model.posterior(&state);
+        let own = model.forecast(&state, &model.calibration().params);
+        let blend = model.forecast(&state, &Params::default());
+        let cv = Forecast::constant_velocity(&state, &undamped);
+        let damped = Forecast::constant_velocity(&state, &Params::default());
+        for j in 1..=model.knots() {
+            let h_s = j as f64 * KNOT_SPACING_S;
+            if sample.t_s + h_s > end_s {
+                break;
+            }
+            let truth = test.position_at(sample.t_s + h_s) - sample.position;
+            scores.add("hold", j, truth);
+            scores.add("gmr", j, mixture.displacement[j - 1] - truth);
+            scores.add("blend", j, blend.knots[j].displacement - truth);
+            scores.add("cv", j, cv.knots[j].displacement - truth);
+            scores.add("damped cv", j, damped.knots[j].displacement - truth);
+            scores.add("own params", j, own.knots[j].displacement - truth);
+        }
+    }
+}
+
+fn report(set: &str, scores: &Scores) {
+    println!("{set}: RMSE ratio to hold at 33 67 100 200 300 500 ms");
+    for name in scores.squared.keys() {
+        let row: Vec<_> = [1, 2, 3, 6, 9, 15]
+            .map(|j| format!("{:.3}", scores.ratio(name, j)))
+            .into();
+        println!("  {name:10} {}", row.join(" "));
+    }
+}
+
+#[test]
+fn three_waves_predict_the_fourth_as_well_as_the_prototype() {
+    let Some(folder) = needs("data/demos/utd_mhad/a03_wave") else {
+        return;
+    };
+    let scores = evaluate(&by_person(&folder), 3);
+    report("a03_wave", &scores);
+    for (knot, prototype) in [(3, 0.403), (6, 0.373), (9, 0.351)] {
+        for name in ["gmr", "blend"] {
+            let ratio = scores.ratio(name, knot);
+            assert!(
+                ratio < 1.05 * prototype,
+                "{name}, knot {knot}: {ratio:.3}, prototype {prototype}"
+            );
+        }
+    }
+}
+
+#[test]
+#[ignore = "a survey over every recording: run by hand, with --release and --nocapture"]
+fn survey() {
+    let Some(root) = needs("data/demos") else {
+        return;
+    };
+    for set in [
+        "utd_mhad/a01_swipe_left",
+        "utd_mhad/a03_wave",
+        "utd_mhad/a09_circle_cw",
+        "utd_mhad/a15_tennis_swing",
+        "kard/a01_horizontal_arm_wave",
+        "robottasks/pouring",
+        "robottasks/openbox",
+        "helloworld/h",
+    ] {
+        report(set, &evaluate(&by_person(&root.join(set)), 3));
+    }
+}
+
+#[test]
+#[ignore = "prints what is learned from every set and how long it takes: run by hand, with --release"]
+fn learned() {
+    let Some(root) = needs("data/demos") else {
+        return;
+    };
+    for (set, most) in [
+        ("utd_mhad/a03_wave", 3),
+        ("utd_mhad/a03_wave", 32),
+        ("kard/a01_horizontal_arm_wave", 3),
+        ("kard/a01_horizontal_arm_wave", 30),
+        ("robottasks/pouring", 9),
+        ("helloworld/h", 8),
+    ] {
+        let mut demos: Vec<_> = by_person(&root.join(set)).concat();
+        demos.truncate(most);
+        let start = std::time::Instant::now();
+        let skill = learn_skill("set", &demos, &LearnOptions::default(), |p| {
+            println!("  {p:?}")
+        })
+        .unwrap();
+        println!(
+            "{set} {} demonstrations: {:.2?}, {} bytes, duration {:.2} s, {:?}, novelty90 {:.1}, {:.2?}",
+            demos.len(),
+            start.elapsed(),
+            skill.to_bytes().len(),
+            skill.duration_s(),
+            skill.stats(),
+            skill.predictor().calibration().novelty90,
+            skill.predictor().calibration(),
+        );
+        let state = states(&demos[0]).nth(20).unwrap();
+        let start = std::time::Instant::now();
+        let mut sum = 0.0;
+        for _ in 0..20_000 {
+            let f = skill
+                .predictor()
+                .forecast(std::hint::black_box(&state), &Params::default());
+            sum += f.knots[3].sigma_m;
+        }
+        println!("  forecast: {:?} ({sum:.1})", start.elapsed() / 20_000);
+    }
+}
