@@ -68,7 +68,7 @@ impl FilterState {
 
 /// A filter whose output's speed, acceleration and jerk never exceed their limits, whatever the target does.
 ///
-/// With e = target − p it is a cascade of saturations (`notes` on driving: one filter, no double compensation):
+/// With e = target − p it is a cascade of saturations, its own velocity and acceleration being what the arm is fed with:
 ///
 /// - v_cmd = ω/3·e, at most v_max, and at most the speed from which braking at 0.8·a_max ends at the target;
 /// - a_cmd = ω·(v_cmd − v), at most a_max;
