@@ -20,7 +20,7 @@ fn data() -> PathBuf {
 }
 
 /// The path below [`data`], or a loud note that the test proves nothing without it.
-fn needs(relative: &str) -> Option<PathBuf> {
+pub(crate) fn needs(relative: &str) -> Option<PathBuf> {
     let path = data().join(relative);
     if path.exists() {
         return Some(path);

@@ -68,7 +68,7 @@ impl FilterState {
 
 /// A filter whose output's speed, acceleration and jerk never exceed their limits, whatever the target does.
 ///
-/// With e = target − p it is a cascade of saturations (`notes` on driving: one filter, no double compensation):
+/// With e = target − p it is a cascade of saturations, its own velocity and acceleration being what the arm is fed with:
 ///
 /// - v_cmd = ω/3·e, at most v_max, and at most the speed from which braking at 0.8·a_max ends at the target;
 /// - a_cmd = ω·(v_cmd − v), at most a_max;
@@ -241,5 +241,204 @@ fn limited(x: Vector3<f64>, max: f64) -> (Vector3<f64>, bool) {
         (x * (max / norm), true)
     } else {
         (x, false)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const CONFIG: FilterConfig = FilterConfig {
+        omega: 45.0,
+        v_max: 1.7,
+        a_max: 13.0,
+        j_max: 6500.0,
+        dt_s: 1e-3,
+    };
+
+    fn filter(config: FilterConfig) -> LimitedFilter {
+        LimitedFilter::new(config, Vector3::zeros()).unwrap()
+    }
+
+    /// The jerk is not part of the state: it is what changed the acceleration.
+    fn assert_within(config: &FilterConfig, before: &FilterState, after: &FilterState) {
+        let slack = 1.0 + 1e-9;
+        let jerk = (after.a - before.a).norm() / config.dt_s;
+        assert!(after.v.norm() <= config.v_max * slack, "{}", after.v.norm());
+        assert!(after.a.norm() <= config.a_max * slack, "{}", after.a.norm());
+        assert!(jerk <= config.j_max * (1.0 + 1e-6), "{jerk}");
+    }
+
+    #[derive(Clone, Debug)]
+    enum Move {
+        Jump([f64; 3]),
+        /// Demand against the present velocity, metres ahead of the output.
+        Against(f64),
+        Ramp([f64; 3]),
+        Stop,
+    }
+
+    fn moves() -> impl Strategy<Value = (Move, f64, usize)> {
+        let vector = || prop::array::uniform3(-3.0..3.0_f64);
+        let kind = prop_oneof![
+            vector().prop_map(Move::Jump),
+            (-3.0..3.0_f64).prop_map(Move::Against),
+            vector().prop_map(Move::Ramp),
+            Just(Move::Stop),
+        ];
+        (kind, 0.0..1.2_f64, 1..150_usize)
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(200))]
+
+        #[test]
+        fn limits_hold_whatever_the_target_does(
+            plan in prop::collection::vec(moves(), 1..25),
+            omega in 5.0..200.0_f64,
+            v_max in 0.05..3.0_f64,
+            a_max in 0.5..30.0_f64,
+            j_max in 200.0..9000.0_f64,
+        ) {
+            let config = FilterConfig { omega, v_max, a_max, j_max, dt_s: 1e-3 };
+            let Ok(mut f) = LimitedFilter::new(config, Vector3::zeros()) else {
+                return Ok(());
+            };
+            for (kind, scale, ticks) in plan {
+                for tick in 0..ticks {
+                    let before = *f.state();
+                    match &kind {
+                        Move::Jump(x) => f.follow((*x).into(), scale),
+                        Move::Against(x) => f.follow(before.p - before.v.normalize() * *x, scale),
+                        Move::Ramp(x) => f.follow(Vector3::from(*x) * (tick as f64 * 1e-3), scale),
+                        Move::Stop => f.stop(),
+                    };
+                    assert_within(&config, &before, f.state());
+                }
+            }
+        }
+
+        #[test]
+        fn a_far_step_arrives_without_overshoot(
+            target in prop::array::uniform3(-1.0..1.0_f64),
+            omega in 15.0..90.0_f64,
+        ) {
+            let target = Vector3::from(target);
+            let mut f = filter(FilterConfig { omega, ..CONFIG });
+            let mut beyond = 0.0_f64;
+            for _ in 0..3000 {
+                f.follow(target, 1.0);
+                beyond = beyond.max((f.state().p.dot(&target.normalize())) - target.norm());
+            }
+            prop_assert!((f.state().p - target).norm() < 1e-6);
+            prop_assert!(beyond < 2e-3, "{beyond} m");
+        }
+
+        #[test]
+        fn stopping_goes_forward_and_ends_at_rest(
+            target in prop::array::uniform3(-1.0..1.0_f64),
+            ticks in 1..400_usize,
+        ) {
+            let mut f = filter(CONFIG);
+            for _ in 0..ticks {
+                f.follow(target.into(), 1.0);
+            }
+            let start = *f.state();
+            let mut back = 0.0_f64;
+            for _ in 0..800 {
+                let before = f.state().p;
+                f.stop();
+                back = back.min((f.state().p - before).dot(&start.v));
+            }
+            // A brake that is already at work cannot be let go at once.
+            let inevitable = start.a.norm().powi(2) / (2.0 * CONFIG.j_max) + CONFIG.a_max * CONFIG.dt_s;
+            let slow = start.v.norm() < 2.0 * inevitable;
+            prop_assert!(slow || back > -1e-9, "{back}");
+            prop_assert_eq!(*f.state(), FilterState::at_rest(f.state().p));
+            let way = (f.state().p - start.p).norm();
+            let v = start.v.norm() + inevitable;
+            prop_assert!(way < v * v / (2.0 * CONFIG.a_max) + v * 0.02 + 1e-4, "{way} m");
+        }
+    }
+
+    #[test]
+    fn linear_law_is_exact() {
+        let mut f = filter(CONFIG);
+        f.state = FilterState {
+            p: Vector3::new(0.01, 0.0, -0.02),
+            v: Vector3::new(0.05, -0.02, 0.01),
+            a: Vector3::new(0.3, 0.1, -0.2),
+        };
+        let (target, before, w) = (Vector3::new(0.012, 0.001, -0.018), f.state, CONFIG.omega);
+        assert!(!f.follow(target, 1.0));
+        let jerk =
+            (target - before.p) * w.powi(3) - before.v * (3.0 * w * w) - before.a * (3.0 * w);
+        assert!((f.state.a - before.a - jerk * CONFIG.dt_s).norm() < 1e-12);
+    }
+
+    #[test]
+    fn a_ramp_is_followed_three_over_omega_late() {
+        let mut f = filter(CONFIG);
+        let velocity = Vector3::new(0.3, -0.2, 0.1);
+        for tick in 0..2000 {
+            f.follow(velocity * (f64::from(tick) * CONFIG.dt_s), 1.0);
+        }
+        let late = velocity * (2000.0 * CONFIG.dt_s) - f.state.p;
+        assert!((late - velocity * (3.0 / CONFIG.omega)).norm() < 1e-9);
+    }
+
+    #[test]
+    fn scale_fades_speed_to_nothing() {
+        let mut f = filter(CONFIG);
+        for _ in 0..300 {
+            f.follow(Vector3::x(), 1.0);
+        }
+        assert!(f.state.v.norm() > 1.0);
+        for _ in 0..2000 {
+            f.follow(Vector3::x() * 9.0, 0.0);
+        }
+        assert!(f.state.v.norm() < 1e-9);
+    }
+
+    #[test]
+    fn nonsense_stops() {
+        let mut f = filter(CONFIG);
+        for _ in 0..300 {
+            f.follow(Vector3::x(), 1.0);
+        }
+        for _ in 0..500 {
+            f.follow(Vector3::new(f64::NAN, 0.0, f64::INFINITY), 1.0);
+        }
+        assert_eq!(f.state.v, Vector3::zeros());
+        assert!(f.state.p.iter().all(|x| x.is_finite()));
+    }
+
+    #[test]
+    fn impossible_configurations_are_refused() {
+        let new = |c| LimitedFilter::new(c, Vector3::zeros()).map(|_| ());
+        let bad = |c| new(c).unwrap_err();
+        assert!(matches!(
+            bad(FilterConfig {
+                omega: f64::NAN,
+                ..CONFIG
+            }),
+            FilterError::NotPositive { what: "omega", .. }
+        ));
+        assert!(matches!(
+            bad(FilterConfig {
+                omega: 400.0,
+                ..CONFIG
+            }),
+            FilterError::TooFast { .. }
+        ));
+        assert!(matches!(
+            bad(FilterConfig {
+                j_max: 50.0,
+                ..CONFIG
+            }),
+            FilterError::JerkTooSmall { .. }
+        ));
     }
 }

@@ -5,6 +5,9 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector3};
 use telemime_sim::arm::{ArmModel, Jacobian, Joints, Kinematics, MAX_JOINTS};
 
+/// How many times a step is resolved again without the joints that are at the end of their range.
+const MAX_DROPPED: usize = 3;
+
 type Rows = SMatrix<f64, 3, MAX_JOINTS>;
 
 /// Gains of the inverse kinematics.
@@ -192,18 +195,31 @@ impl DifferentialIk {
         self.kinematics.update(&self.arm, &ahead);
         let error_m = p - self.kinematics.tip();
         let turn = orientation_error(self.kinematics.tip_rotation(), &self.orientation);
-        let resolved = resolve(
-            &self.kinematics.jacobian(),
-            &(v + error_m * self.config.position_gain),
-            &(turn * self.config.orientation_gain),
-            &((self.rest - ahead) * self.config.posture_gain),
-            singular_below(&self.arm),
-        );
+        let mut jacobian = self.kinematics.jacobian();
+        let tip_velocity = v + error_m * self.config.position_gain;
+        let angular_velocity = turn * self.config.orientation_gain;
+        let idle = (self.rest - ahead) * self.config.posture_gain;
+        let epsilon = singular_below(&self.arm);
+        let (lower, upper) = self.speed_window(&ahead);
+        let mut resolved = resolve(&jacobian, &tip_velocity, &angular_velocity, &idle, epsilon);
+        let sigma_min = resolved.sigma_min;
+        let mut at_limit = 0;
+        // A joint at its end does not hold up the others: they take the motion over as far as they can (as in Flacco et al. 2015).
+        for _ in 0..MAX_DROPPED {
+            let blocked = self.blocked(&resolved.primary, &lower, &upper) & !at_limit;
+            if blocked == 0 {
+                break;
+            }
+            at_limit |= blocked;
+            for i in (0..self.arm.dof()).filter(|i| blocked >> i & 1 == 1) {
+                jacobian.column_mut(i).fill(0.0);
+            }
+            resolved = resolve(&jacobian, &tip_velocity, &angular_velocity, &idle, epsilon);
+        }
         let towards = if secondary { 1.0 } else { 0.0 };
         let fade = 10.0 * h;
         self.secondary_share += (towards - self.secondary_share).clamp(-fade, fade);
 
-        let (lower, upper) = self.speed_window(&ahead);
         let primary_share = largest_share(&Joints::zeros(), &resolved.primary, &lower, &upper);
         let primary = resolved.primary * primary_share;
         let secondary = resolved.secondary * self.secondary_share;
@@ -212,14 +228,10 @@ impl DifferentialIk {
         let change = wanted - qd;
         let change_share = largest_share(&Joints::zeros(), &change, &-most, &most);
         let mut next = qd + change * change_share;
-        let mut at_limit = 0;
-        for (i, joint) in self.arm.joints().iter().enumerate() {
-            let near_stop = upper[i] < joint.velocity && next[i] >= upper[i]
-                || -lower[i] < joint.velocity && next[i] <= lower[i];
+        for i in 0..self.arm.dof() {
             // Slowing all joints alike for one joint's acceleration must not keep another from braking before its stop.
             next[i] = next[i].clamp(lower[i].max(-f64::MAX), upper[i].min(f64::MAX));
             next[i] = next[i].clamp(qd[i] - most[i], qd[i] + most[i]);
-            at_limit |= u16::from(near_stop) << i;
         }
         let mut q_next = q + (qd + next) * (0.5 * h);
         for (i, joint) in self.arm.joints().iter().enumerate() {
@@ -237,10 +249,21 @@ impl DifferentialIk {
         };
         JointStep {
             slowed: primary_share < 1.0 || change_share < 1.0,
-            singular: resolved.sigma_min < singular_below(&self.arm),
+            singular: sigma_min < epsilon,
             at_limit,
             error_m,
         }
+    }
+
+    /// Joints (bits) that `motion` would press against the end of their range.
+    fn blocked(&self, motion: &Joints, lower: &Joints, upper: &Joints) -> u16 {
+        let mut blocked = 0;
+        for (i, joint) in self.arm.joints().iter().enumerate() {
+            let left = if motion[i] > 0.0 { upper[i] } else { -lower[i] };
+            let slow = 0.1 * joint.velocity.min(3.0);
+            blocked |= u16::from(left < slow && motion[i].abs() > left) << i;
+        }
+        blocked
     }
 
     /// Joint speeds that respect the speed limit and leave room to brake, at half the acceleration limit, before the end of range.

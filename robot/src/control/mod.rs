@@ -9,6 +9,9 @@ mod ik;
 mod posture;
 mod torque;
 
+#[cfg(test)]
+mod tests;
+
 pub use controller::{
     ClampCounts, Clamps, ControlConfig, ControlError, Controller, Demand, Output,
 };

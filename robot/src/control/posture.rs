@@ -8,6 +8,9 @@ use telemime_sim::arm::{ArmModel, Dynamics, Joint, Joints, Kinematics, MAX_JOINT
 use super::ControlError;
 use super::ik::{largest_share, min_eigenvalue, orientation_error, resolve};
 
+/// No joint reference accelerates faster, rad/s² (m/s²), whatever its motor could do with it alone: joints load each other.
+const ACCELERATION_CAP: f64 = 30.0;
+
 /// Speed, acceleration and jerk of the tip that every direction allows at a posture.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CartesianLimits {
@@ -21,7 +24,7 @@ pub struct CartesianLimits {
 
 impl CartesianLimits {
     /// These limits, lowered to what the joints allow at `q` in the worst direction, moving by the pseudo-inverse J⁺ of the position Jacobian:
-    /// speed to min q̇ᵢ ⁄ ‖row i of J⁺‖; acceleration to the same of the URDF's acceleration limits and to
+    /// speed to min q̇ᵢ ⁄ ‖row i of J⁺‖; acceleration to the same of the URDF's acceleration limits (at most 30 rad/s²) and to
     /// min (0.8·τᵢ − |gᵢ|) ⁄ ‖row i of M J⁺‖. Away from `q` the joints may allow less: there the inverse kinematics slows.
     ///
     /// # Errors
@@ -47,7 +50,7 @@ impl CartesianLimits {
             limits.v_max = limits.v_max.min(joint.velocity / rate);
             limits.a_max = limits
                 .a_max
-                .min(joint.acceleration / rate)
+                .min(joint.acceleration.min(ACCELERATION_CAP) / rate)
                 .min(headroom[i] / torques.row(i).norm());
         }
         Ok(limits)
@@ -73,7 +76,7 @@ fn headroom(arm: &ArmModel, dynamics: &mut Dynamics) -> Result<Joints, ControlEr
 }
 
 /// Largest acceleration of each joint moving alone at `q`: the URDF's limit if it states one, at most what 0.8 of its effort limit gives beside gravity,
-/// at most 100 rad/s² (m/s²).
+/// at most 30 rad/s² (m/s²): what published arms state is less.
 ///
 /// # Errors
 /// [`ControlError::TooWeak`] if a joint cannot carry the arm at `q`.
@@ -86,7 +89,7 @@ pub fn joint_accelerations(arm: &ArmModel, q: &Joints) -> Result<Joints, Control
     for (i, joint) in arm.joints().iter().enumerate() {
         out[i] = (headroom[i] / mass[(i, i)])
             .min(joint.acceleration)
-            .min(100.0);
+            .min(ACCELERATION_CAP);
     }
     Ok(out)
 }

@@ -3,8 +3,13 @@
 use telemime_sim::arm::{ArmModel, Dynamics, Joints};
 
 use super::JointReference;
+use super::ik::largest_share;
 
-/// τ = M(q)(q̈_ref + k_p e + k_d ė) + c(q, q̇) + g(q) + friction(q̇_ref), by recursive Newton-Euler, cut to the effort limits.
+/// A joint left behind by a cut torque returns to its reference faster than that by at most this share of its speed limit.
+const CATCH_UP: f64 = 0.1;
+
+/// τ = M(q)(q̈_ref + k_p e + k_d ė) + c(q, q̇) + g(q) + friction(q̇_ref), by recursive Newton-Euler. Where a joint's torque would exceed its
+/// effort limit, the acceleration of all joints is reduced, so that the arm slows on its path.
 #[derive(Clone, Debug)]
 pub struct ComputedTorque {
     stiffness: f64,
@@ -23,7 +28,7 @@ impl ComputedTorque {
     }
 
     /// Torques (N·m, N) at the measured `q`, `qd` that lead to `reference`, whose q and qd are for now and whose qdd lasts until the next tick,
-    /// and the joints (bits) whose torque was cut.
+    /// and the joints (bits) that lack torque for it.
     pub fn torque(
         &mut self,
         arm: &ArmModel,
@@ -32,19 +37,30 @@ impl ComputedTorque {
         qd: &Joints,
     ) -> (Joints, u16) {
         self.dynamics.update(arm, q);
-        let qdd =
-            reference.qdd + (reference.q - q) * self.stiffness + (reference.qd - qd) * self.damping;
-        let wanted = self.dynamics.rnea(qd, &qdd) + arm.friction(&reference.qd);
-        let (mut tau, mut cut) = (Joints::zeros(), 0);
-        for (i, joint) in arm.joints().iter().enumerate() {
-            tau[i] = wanted[i].clamp(-joint.effort, joint.effort);
-            cut |= u16::from(tau[i] != wanted[i]) << i;
+        let reach = arm.per_joint(|j| CATCH_UP * j.velocity * self.damping / self.stiffness);
+        let error = clamped(&(reference.q - q), &reach);
+        let qdd = reference.qdd + error * self.stiffness + (reference.qd - qd) * self.damping;
+        let friction = arm.friction(&reference.qd);
+        let most = arm.per_joint(|j| j.effort);
+        let carried = self.dynamics.rnea(qd, &Joints::zeros()) + friction;
+        let wanted = self.dynamics.rnea(qd, &qdd) + friction;
+        // Cutting one joint alone would throw the others: all accelerate less.
+        let base = clamped(&carried, &most);
+        let asked = wanted - carried;
+        let tau = base + asked * largest_share(&base, &asked, &-most, &most);
+        let mut cut = 0;
+        for i in 0..arm.dof() {
+            cut |= u16::from(wanted[i].abs() > most[i]) << i;
         }
-        (tau, cut)
+        (clamped(&tau, &most), cut)
     }
 
     /// The dynamics workspace at the last measured posture.
     pub(super) fn dynamics(&self) -> &Dynamics {
         &self.dynamics
     }
+}
+
+fn clamped(tau: &Joints, most: &Joints) -> Joints {
+    tau.zip_map(most, |tau, most| tau.clamp(-most, most))
 }

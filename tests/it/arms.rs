@@ -1,0 +1,145 @@
+//! Published arms: their descriptions load with the right notices, hold against gravity, and follow a circle.
+//!
+//! The descriptions are public but not ours to ship: without them these tests say that they are skipped.
+
+use std::sync::Arc;
+
+use nalgebra::Vector3;
+use telemime_robot::control::{
+    CartesianLimits, ControlConfig, Controller, Demand, home_posture, workspace_radius,
+};
+use telemime_sim::arm::{ArmModel, Kinematics, LoadOptions, Notice, Plant};
+
+use crate::prediction::needs;
+
+const DT_S: f64 = 1e-3;
+
+fn load(file: &str) -> Option<Arc<ArmModel>> {
+    let path = needs(&format!("data/urdf/{file}"))?;
+    let text = std::fs::read_to_string(path).unwrap();
+    Some(Arc::new(
+        ArmModel::from_urdf(&text, &LoadOptions::default()).unwrap(),
+    ))
+}
+
+#[test]
+fn published_descriptions_give_their_arm_and_say_what_was_assumed() {
+    let cases = [
+        ("ur5e/ur5e.urdf", 6, "tool0"),
+        ("example-robot-data/ur5_robot.urdf", 6, "tool0"),
+        ("example-robot-data/panda.urdf", 7, "panda_hand_tcp"),
+        ("franka_description/fr3.urdf", 7, "fr3_link8"),
+        ("franka_description/fer.urdf", 7, "fer_link8"),
+        (
+            "drake_iiwa14/iiwa14_no_collision.urdf",
+            7,
+            "iiwa_link_ee_kuka",
+        ),
+        (
+            "kinova_gen3/GEN3-7DOF-NOVISION_FOR_URDF_ARM_V12.urdf",
+            7,
+            "end_effector_link",
+        ),
+        ("xarm/xarm6.urdf", 6, "link_eef"),
+        ("xarm/xarm7.urdf", 7, "link_eef"),
+        ("so-arm100/so100.urdf", 5, "gripper"),
+        ("so-arm100/so101_new_calib.urdf", 5, "gripper_frame_link"),
+    ];
+    for (file, dof, tip) in cases {
+        let Some(arm) = load(file) else { return };
+        assert_eq!((arm.dof(), arm.tip()), (dof, tip), "{file}");
+        let says = |what: fn(&Notice) -> bool| arm.notices().iter().filter(|n| what(n)).count();
+        let fixed = says(|n| matches!(n, Notice::JointFixed { .. }));
+        let expected = match file {
+            "example-robot-data/panda.urdf" => 2,
+            "so-arm100/so100.urdf" | "so-arm100/so101_new_calib.urdf" => 1,
+            _ => 0,
+        };
+        assert_eq!(fixed, expected, "{file}");
+        let impossible = says(|n| matches!(n, Notice::TriangleInequality { .. }));
+        assert_eq!(
+            impossible,
+            usize::from(file.ends_with("fer.urdf")),
+            "{file}"
+        );
+        let unlimited = arm.joints().iter().filter(|j| !j.is_limited()).count();
+        assert_eq!(
+            unlimited,
+            if file.contains("GEN3") { 4 } else { 0 },
+            "{file}"
+        );
+    }
+}
+
+/// Holds for a second, then a circle of 5 cm radius in 2 s, 3/ω ahead; returns the worst distances in m of the tip from where it
+/// started, from the filter's output, and from the circle.
+fn drive(arm: &Arc<ArmModel>) -> (f64, f64, f64) {
+    let home = home_posture(arm);
+    let mut kinematics = Kinematics::new();
+    kinematics.update(arm, &home);
+    let start = kinematics.tip();
+    let mut controller =
+        Controller::new(Arc::clone(arm), &ControlConfig::default(), &home).unwrap();
+    let mut plant = Plant::new(Arc::clone(arm), &home).unwrap();
+    let circle = |t: f64| {
+        let turned = (t.max(0.0) / 2.0).min(1.0);
+        // Minimum jerk along the circle: it begins and ends at rest.
+        let s = turned.powi(3) * (10.0 - 15.0 * turned + 6.0 * turned * turned);
+        let angle = core::f64::consts::TAU * s;
+        start + Vector3::new(0.0, angle.sin(), 1.0 - angle.cos()) * 0.05
+    };
+    let (mut held, mut servo, mut off) = (0.0_f64, 0.0_f64, 0.0_f64);
+    for tick in 0..3500 {
+        let t = f64::from(tick) * DT_S - 1.0;
+        let demand = if t < 0.0 {
+            Demand::Stop
+        } else {
+            Demand::Follow {
+                target: circle(t + controller.lag_s()),
+                speed_scale: 1.0,
+            }
+        };
+        let (q, qd) = (*plant.q(), *plant.qd());
+        let out = controller.tick(demand, &q, &qd);
+        let report = plant.step(&out.tau, DT_S);
+        assert_eq!((report.stopped, report.invalid, report.clamped), (0, 0, 0));
+        if t < 0.0 {
+            held = held.max((out.tip - start).norm());
+        } else {
+            servo = servo.max((out.tip - out.reference.p).norm());
+            off = off.max((out.tip - circle(t)).norm());
+        }
+    }
+    let CartesianLimits { v_max, a_max, .. } = *controller.limits();
+    println!(
+        "{}: reach {:.3} m around home, {v_max:.2} m/s, {a_max:.1} m/s²; held within {:.4} mm, filter to tip {:.3} mm, off the circle {:.3} mm, {:?}",
+        arm.name(),
+        workspace_radius(arm, &home),
+        held * 1e3,
+        servo * 1e3,
+        off * 1e3,
+        controller.counts()
+    );
+    (held, servo, off)
+}
+
+#[test]
+fn published_arms_hold_and_follow_a_circle() {
+    for file in [
+        "ur5e/ur5e.urdf",
+        "example-robot-data/panda.urdf",
+        "franka_description/fr3.urdf",
+        "franka_description/fer.urdf",
+        "drake_iiwa14/iiwa14_no_collision.urdf",
+        "kinova_gen3/GEN3-7DOF-NOVISION_FOR_URDF_ARM_V12.urdf",
+        "xarm/xarm6.urdf",
+        "xarm/xarm7.urdf",
+        "so-arm100/so101_new_calib.urdf",
+    ] {
+        let Some(arm) = load(file) else { return };
+        let (held, servo, off) = drive(&arm);
+        assert!(held < 1e-4, "{file}: {held} m");
+        assert!(servo < 1e-3, "{file}: {servo} m");
+        assert!(off < 4e-3, "{file}: {off} m");
+    }
+}
