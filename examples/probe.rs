@@ -18,7 +18,7 @@ fn main() {
     let mut sums = [0.0; 8];
     let cases: Vec<(String, Vec<Demonstration>, Demonstration)> = if mode == "swing" {
         (0..6u64).map(|seed| {
-            let d = |i| Demonstration::from_samples(format!("p{i}"), telemime_sim::hand::swing(seed, i).iter().map(telemime_sim::hand::swing(seed, i).iter().map(|(t, x)| Sample { t_s: *t, position: Vector3::from(*x) }).collect::<Vec<_>>()).unwrap();
+            let d = |i| Demonstration::from_samples(format!("p{i}"), &telemime_sim::hand::swing(seed, i).iter().map(|(t, x)| Sample { t_s: *t, position: Vector3::from(*x) }).collect::<Vec<_>>()).unwrap();
             (format!("seed{seed}"), (0..5).map(d).collect(), d(5))
         }).collect()
     } else {

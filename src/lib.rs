@@ -2,3 +2,4 @@
 
 pub mod ground;
 pub mod measure;
+pub mod relay;

@@ -1,10 +1,10 @@
 //! The robot's shell: accepts one operator at a time, carries bytes to the session and reports from the servo.
 
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use quinn::{Connection, Endpoint, Incoming, SendStream, VarInt};
+use telemime_endpoint::cli::Word;
 use telemime_endpoint::control::{Control, ControlError, write_frame};
 use telemime_endpoint::{HostClock, quic};
 use telemime_protocol::skill::Skill;
@@ -86,7 +86,12 @@ struct Active {
 
 impl Daemon {
     /// Serves operators until `quit` turns true; then the arm is stopped (latched) and the endpoint closed.
-    pub async fn run(mut self, mut quit: watch::Receiver<bool>, notices: mpsc::UnboundedSender<Notice>) {
+    pub async fn run(
+        mut self,
+        mut quit: watch::Receiver<bool>,
+        mut words: mpsc::UnboundedReceiver<Word>,
+        notices: mpsc::UnboundedSender<Notice>,
+    ) {
         let (greeted_tx, mut greeted) = mpsc::channel::<Greeted>(MAX_GREETING);
         let mut drain = interval(DRAIN);
         drain.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -102,6 +107,10 @@ impl Daemon {
             tokio::select! {
                 biased;
                 _ = quit.wait_for(|quit| *quit) => break,
+                Some(word) = words.recv() => self.order(match word {
+                    Word::Stop => Order::Stop(Cause::LocalStop),
+                    Word::Reset => Order::Reset { operator: active.is_some() },
+                }),
                 _ = drain.tick() => self.drain(active.as_mut(), &notices),
                 why = receive(active.as_mut(), &self.clock) => if let Some(why) = why {
                     self.end(&mut active, &mut skill, &why, &notices);
@@ -193,10 +202,9 @@ impl Daemon {
     }
 
     fn drain(&mut self, mut active: Option<&mut Active>, notices: &mpsc::UnboundedSender<Notice>) {
-        let timing = self.timing.as_deref().map_or_else(TickTiming::default, |t| TickTiming {
-            mean_ns: t.mean_ns.load(Ordering::Relaxed),
-            p99_ns: t.p99_ns.load(Ordering::Relaxed),
-            overruns: t.overruns.load(Ordering::Relaxed),
+        let timing = self.timing.as_deref().map_or_else(TickTiming::default, |timing| {
+            let (_, mean_ns, p99_ns, overruns) = timing.read();
+            TickTiming { mean_ns, p99_ns, overruns }
         });
         while let Ok(report) = self.servo.reports.pop() {
             if let Some(active) = active.as_deref_mut() {

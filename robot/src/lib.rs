@@ -4,6 +4,7 @@
 //! Data flows one way: datagram → [`session`] → [`servo`] (prediction, [`safety`], [`control`], arm) →
 //! report → [`session`] → telemetry.
 
+pub mod cli;
 pub mod clock;
 pub mod control;
 pub mod daemon;

@@ -7,6 +7,7 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 
+use telemime_endpoint::cli::Word;
 use telemime_endpoint::quic::EndpointError;
 use telemime_endpoint::{HostClock, Identity, IdentityError, Meter, Mono, quic};
 use telemime_operator::daemon::{Daemon as OperatorDaemon, DaemonError, Notice as OperatorNotice, Summary};
@@ -70,6 +71,7 @@ pub struct Robot {
     reports: Rc<RefCell<Vec<Report>>>,
     notices: Rc<RefCell<Vec<RobotNotice>>>,
     quit: watch::Sender<bool>,
+    words: mpsc::UnboundedSender<Word>,
 }
 
 /// An operator of a [`Pair`], running.
@@ -90,6 +92,12 @@ impl Robot {
     /// Everything else it noticed so far.
     pub fn notices(&self) -> std::cell::Ref<'_, Vec<RobotNotice>> {
         self.notices.borrow()
+    }
+
+    /// A word at the robot's own terminal.
+    pub fn say(&self, word: Word) {
+        // The daemon has ended if nobody hears it.
+        let _ = self.words.send(word);
     }
 
     /// Stops the daemon, as Ctrl-C does.
@@ -143,8 +151,9 @@ impl Pair {
         };
         let (quit, quit_rx) = watch::channel(false);
         let (tx, mut rx) = mpsc::unbounded_channel();
-        tokio::task::spawn_local(daemon.run(quit_rx, tx));
-        let robot = Robot { reports: Rc::default(), notices: Rc::default(), quit };
+        let (words, words_rx) = mpsc::unbounded_channel();
+        tokio::task::spawn_local(daemon.run(quit_rx, words_rx, tx));
+        let robot = Robot { reports: Rc::default(), notices: Rc::default(), quit, words };
         let log = robot.clone();
         tokio::task::spawn_local(async move {
             while let Some(notice) = rx.recv().await {

@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 
 use nalgebra::Vector3;
 use telemime_protocol::predict::{Forecast, HandState, Model, Params};
+use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 
 /// What an error made a sample ago still counts.
@@ -16,12 +17,16 @@ const PRIOR: f64 = 10.0;
 /// Bounds of the mixture's trust before anything was seen: whatever was calibrated can still be outvoted.
 const PRIOR_TRUST: std::ops::RangeInclusive<f64> = 0.05..=0.98;
 
+/// A hand that has moved less than this share of the skill's reach lately is at rest.
+const REST: f64 = 0.02;
+
 /// Horizons judged at, s: below, everything is right; above, too few verdicts come in.
 const HORIZON_S: std::ops::RangeInclusive<f64> = 0.05..=0.5;
 
 /// A prediction that waits for its truth.
 struct Pending {
     due: Stamp,
+    weight: f64,
     origin: Vector3<f64>,
     mixture: Option<Vector3<f64>>,
     straight: Vector3<f64>,
@@ -32,6 +37,7 @@ pub(super) struct Adaptation {
     /// A priori the straight line errs this many times as much (in squares) as the mixture.
     ratio: f64,
     damping: f64,
+    rest_m: f64,
     pending: VecDeque<Pending>,
     mixture_error: f64,
     straight_error: f64,
@@ -45,13 +51,14 @@ const MIXTURE: Params = Params { gain: 1.0, trust: 1.0, cv_damping: 0.0 };
 
 impl Adaptation {
     /// Starts from what was calibrated with the skill, or from the defaults.
-    pub(super) fn new(gain: f64, model: Option<&Model>) -> Self {
-        let start = model.map_or(Params::DEFAULT, |model| model.calibration().params);
+    pub(super) fn new(gain: f64, skill: Option<&Skill>) -> Self {
+        let start = skill.map_or(Params::DEFAULT, |skill| skill.predictor().calibration().params);
         let trust = start.trust.clamp(*PRIOR_TRUST.start(), *PRIOR_TRUST.end());
         Self {
             gain: gain.clamp(0.0, 1.0),
             ratio: (trust / (1.0 - trust)).sqrt(),
             damping: start.cv_damping,
+            rest_m: skill.map_or(0.0, |skill| REST * skill.stats().reach_m).max(1e-3),
             pending: VecDeque::new(),
             mixture_error: 0.0,
             straight_error: 0.0,
@@ -61,16 +68,28 @@ impl Adaptation {
         }
     }
 
-    /// The numbers that travel.
+    /// The numbers that travel, for a prediction from `hand`.
     ///
-    /// Trust: weights ∝ (mean squared error)⁻² (prediction.md §3). Damping: the least-squares factor on
-    /// the velocity, drawn to the calibrated one where nothing has moved yet.
-    pub(super) fn params(&self) -> Params {
+    /// Trust: weights ∝ (mean squared error)⁻² (prediction.md §3), and less while the hand rests: a skill
+    /// knows that motion will begin, not when. Damping: the least-squares factor on the velocity, drawn to
+    /// the calibrated one where nothing has moved yet.
+    pub(super) fn params(&self, hand: &HandState) -> Params {
         let prior = self.prior.unwrap_or(1.0);
         let mixture = (self.mixture_error + prior).powi(2);
         let straight = (self.straight_error + self.ratio * prior).powi(2);
-        let cv_damping = (self.along + self.damping * prior) / (self.square + prior);
-        Params { gain: self.gain, trust: straight / (straight + mixture), cv_damping: cv_damping.clamp(0.0, 1.0) }
+        let trust = self.moving(hand) * straight / (straight + mixture);
+        Params { gain: self.gain, trust, cv_damping: self.cv_damping() }
+    }
+
+    fn cv_damping(&self) -> f64 {
+        let prior = self.prior.unwrap_or(1.0);
+        ((self.along + self.damping * prior) / (self.square + prior)).clamp(0.0, 1.0)
+    }
+
+    /// From 0 for a hand at rest to 1 for one in motion.
+    fn moving(&self, hand: &HandState) -> f64 {
+        let moved = hand.memory.iter().map(|m| (hand.x - m).norm_squared()).fold(0.0, f64::max);
+        moved / (moved + self.rest_m * self.rest_m)
     }
 
     /// Judges what was predicted for the time up to `newest`, and predicts `horizon_s` ahead of it.
@@ -95,6 +114,7 @@ impl Adaptation {
         }
         self.pending.push_back(Pending {
             due: newest.t.offset_by_secs(horizon_s),
+            weight: self.moving(newest),
             origin: newest.x,
             mixture: mixture.map(|p| p.position),
             straight,
@@ -103,13 +123,12 @@ impl Adaptation {
 
     fn judge(&mut self, pending: &Pending, truth: Vector3<f64>) {
         let (run, moved) = (pending.straight - pending.origin, truth - pending.origin);
+        let straight = pending.origin + run * self.cv_damping();
+        self.straight_error = MEMORY * self.straight_error + pending.weight * (straight - truth).norm_squared();
+        if let Some(mixture) = pending.mixture {
+            self.mixture_error = MEMORY * self.mixture_error + pending.weight * (mixture - truth).norm_squared();
+        }
         self.along = MEMORY * self.along + run.dot(&moved);
         self.square = MEMORY * self.square + run.norm_squared();
-        let damping = self.params().cv_damping;
-        let straight = pending.origin + run * damping;
-        self.straight_error = MEMORY * self.straight_error + (straight - truth).norm_squared();
-        if let Some(mixture) = pending.mixture {
-            self.mixture_error = MEMORY * self.mixture_error + (mixture - truth).norm_squared();
-        }
     }
 }

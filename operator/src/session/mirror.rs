@@ -53,7 +53,7 @@ impl Mirror {
             path: PathEncoder::new(path_bound_m)?,
             unacknowledged: VecDeque::new(),
             first_unacknowledged: 0,
-            adaptation: Adaptation::new(gain, skill.map(Skill::predictor)),
+            adaptation: Adaptation::new(gain, skill),
             without_model: false,
             newest: None,
             sent: None,
@@ -64,7 +64,7 @@ impl Mirror {
     /// What an engage request carries.
     pub(super) fn reference(&self, skill: Option<&Skill>) -> Option<(WireState, u16, WireParams)> {
         let state = WireState::quantise(&self.hand)?;
-        Some((state, self.model(skill), WireParams::quantise(&self.adaptation.params())))
+        Some((state, self.model(skill), WireParams::quantise(&self.adaptation.params(&self.hand))))
     }
 
     pub(super) fn go_without_model(&mut self) {
@@ -127,7 +127,7 @@ impl Mirror {
             seq: 0,
             lease_ms: 0,
             model: self.model(skill),
-            params: WireParams::quantise(&self.adaptation.params()),
+            params: WireParams::quantise(&self.adaptation.params(&self.hand)),
             checksum: (self.messages % KEYFRAME == 1).then(|| forecast.checksum()),
             state,
             first_knot: self.first_unacknowledged,
@@ -142,7 +142,7 @@ impl Mirror {
     /// What the robot would predict if it were sent the newest state now: from the numbers as they travel.
     fn predict(&self, skill: Option<&Skill>) -> Option<Forecast> {
         let state = WireState::quantise(&self.hand)?.dequantise();
-        let params: Params = WireParams::quantise(&self.adaptation.params()).dequantise();
+        let params: Params = WireParams::quantise(&self.adaptation.params(&self.hand)).dequantise();
         Some(match skill {
             Some(skill) => skill.predictor().forecast(&state, &params),
             None => Forecast::constant_velocity(&state, &params),

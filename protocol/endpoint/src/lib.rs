@@ -1,6 +1,7 @@
 //! What the two daemons' shells share and the protocol must not know: the host's clock, an identity,
 //! TLS that trusts pinned keys only, and QUIC set up for teleoperation.
 
+pub mod cli;
 pub mod clock;
 pub mod control;
 pub mod identity;

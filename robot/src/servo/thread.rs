@@ -2,7 +2,7 @@
 
 use std::io;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 
 use rustix::thread::clock_nanosleep_absolute;
@@ -24,6 +24,16 @@ pub struct Timing {
     pub p99_ns: AtomicU32,
     /// Ticks that began more than a period late.
     pub overruns: AtomicU32,
+    /// Ticks so far.
+    pub ticks: AtomicU64,
+}
+
+impl Timing {
+    /// Ticks, mean and 99th percentile (ns), overruns.
+    pub fn read(&self) -> (u64, u32, u32, u32) {
+        let get = |value: &AtomicU32| value.load(Ordering::Relaxed);
+        (self.ticks.load(Ordering::Relaxed), get(&self.mean_ns), get(&self.p99_ns), get(&self.overruns))
+    }
 }
 
 /// A running servo; dropping it stops the thread after the current tick.
@@ -89,6 +99,7 @@ fn run(mut core: Core, timing: &Timing, quit: &AtomicBool) {
             timing.mean_ns.store(stats.mean_ns(), Ordering::Relaxed);
             timing.p99_ns.store(stats.quantile_ns(0.99), Ordering::Relaxed);
             timing.overruns.store(overruns, Ordering::Relaxed);
+            timing.ticks.store(stats.count(), Ordering::Relaxed);
         }
     }
 }

@@ -1,0 +1,322 @@
+//! The robot daemon's command line: flags over a TOML file over defaults.
+
+use std::io::Write as _;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
+
+use anyhow::{Context, bail};
+use serde::{Deserialize, Serialize};
+use telemime_endpoint::cli::{self, emit};
+use telemime_endpoint::{Fingerprint, HostClock, Identity, Meter, quic};
+use telemime_sim::arm::LoadOptions;
+use tokio::sync::mpsc;
+
+use crate::control::ControlConfig;
+use crate::daemon::{Daemon, Notice};
+use crate::rig::{Rig, RigOptions};
+use crate::servo::{self, Report};
+use crate::session::SessionConfig;
+
+/// Drive an arm for an operator.
+///
+/// The robot makes its key at the first start and prints its fingerprint; give that to the operator with
+/// --peer, and the operator's to the robot. Without a peer nobody is let in. On the terminal, type stop
+/// (emergency stop, latched), reset or quit.
+#[derive(clap::Args, Debug, Clone, Default)]
+pub struct Args {
+    /// Read settings from this TOML file; flags override it.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Listen for the operator on this UDP address [default: 0.0.0.0:4433].
+    #[arg(long, value_name = "ADDR")]
+    pub listen: Option<SocketAddr>,
+    /// This robot's private key, made if missing [default: ~/.config/telemime/robot.key].
+    #[arg(long, value_name = "FILE")]
+    pub identity: Option<PathBuf>,
+    /// Fingerprint of an operator to let in; may be repeated.
+    #[arg(long, value_name = "FINGERPRINT")]
+    pub peer: Vec<String>,
+    /// The arm [default: a 7-axis arm of our own].
+    #[arg(long, value_name = "FILE")]
+    pub urdf: Option<PathBuf>,
+    /// The link that follows the hand [default: tool0, tcp, or the deepest link].
+    #[arg(long, value_name = "LINK")]
+    pub tip: Option<String>,
+    /// Fix a joint that is not on the way to the tip (a finger); may be repeated.
+    #[arg(long, value_name = "JOINT=VALUE", value_parser = parse_fixed)]
+    pub fixed: Vec<(String, f64)>,
+    /// Start posture, one value per joint, rad or m [default: searched].
+    #[arg(long, value_name = "Q1,Q2,…", value_delimiter = ',', allow_negative_numbers = true)]
+    pub start: Option<Vec<f64>>,
+    /// Write every tick to this CSV file.
+    #[arg(long, value_name = "FILE")]
+    pub record: Option<PathBuf>,
+    /// Print events as JSON lines on stdout.
+    #[arg(long)]
+    pub json: bool,
+    /// Stop when stdin ends: for a parent process that must not leave orphans.
+    #[arg(long, hide = true)]
+    pub follow_stdin: bool,
+}
+
+/// The TOML file; every key may be left out.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    listen: Option<SocketAddr>,
+    identity: Option<PathBuf>,
+    #[serde(default)]
+    peers: Vec<String>,
+    urdf: Option<PathBuf>,
+    tip: Option<String>,
+    #[serde(default)]
+    fixed: std::collections::BTreeMap<String, f64>,
+    start: Option<Vec<f64>>,
+    record: Option<PathBuf>,
+}
+
+fn parse_fixed(text: &str) -> Result<(String, f64), String> {
+    let (joint, value) = text.split_once('=').ok_or("write JOINT=VALUE")?;
+    let value = value.parse::<f64>().map_err(|e| format!("`{value}`: {e}"))?;
+    Ok((joint.to_owned(), value))
+}
+
+/// What the robot prints with `--json`; `docs/commands.md` lists the fields.
+#[derive(Debug, Serialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+enum Event<'a> {
+    Listening { addr: SocketAddr, fingerprint: String, arm: &'a str, joints: usize, lag_s: f64, radius_m: f64 },
+    Connected { epoch: u32, peer: SocketAddr },
+    Disconnected { why: &'a str, received: u32, dropped: u32, clock_offset_s: Option<f64>, clock_bound_s: Option<f64> },
+    Refused { why: &'a str },
+    State { state: String, cause: String, mono_ns: i64 },
+    Engaged { engagement: u32, mono_ns: i64, scale: f64, rotation: [f64; 4], hand_m: [f64; 3], tip_m: [f64; 3] },
+    Path { knots: &'a [(f64, [f64; 3], [f64; 3])] },
+    Servo { ticks: u64, mean_ns: u32, p99_ns: u32, overruns: u32 },
+}
+
+/// Runs the daemon until it is told to stop.
+///
+/// # Errors
+/// One line that says what to do.
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("no runtime")?;
+    runtime.block_on(serve(args))
+}
+
+async fn serve(args: &Args) -> anyhow::Result<()> {
+    let file = match &args.config {
+        Some(path) => read_config(path)?,
+        None => File::default(),
+    };
+    let identity = args.identity.clone().or(file.identity);
+    let identity = Identity::load_or_create(&identity.unwrap_or_else(|| cli::config_dir().join("robot.key")))?;
+    let peers = if args.peer.is_empty() { file.peers } else { args.peer.clone() };
+    let peers = peers.iter().map(|p| p.parse()).collect::<Result<Vec<Fingerprint>, _>>()?;
+    let mut fixed = file.fixed;
+    fixed.extend(args.fixed.iter().cloned());
+    let options = RigOptions {
+        urdf: args.urdf.clone().or(file.urdf),
+        load: LoadOptions { tip: args.tip.clone().or(file.tip), fixed },
+        start: args.start.clone().or(file.start),
+        control: ControlConfig::default(),
+        ..RigOptions::default()
+    };
+    let rig = Rig::load(&options)?;
+    for notice in rig.arm.notices() {
+        eprintln!("note: {notice}");
+    }
+    let recorder = args.record.clone().or(file.record).map(|path| Recorder::start(&path, rig.arm.dof())).transpose()?;
+    let listen = args.listen.or(file.listen).unwrap_or_else(|| SocketAddr::from(([0, 0, 0, 0], 4433)));
+    let socket = quic::Socket::bind(listen)
+        .with_context(|| format!("cannot listen on {listen}: choose another --listen, or stop what uses it"))?;
+    if peers.is_empty() && !args.json {
+        eprintln!("note: no --peer given: nobody will be let in");
+    }
+    let endpoint = quic::server(&identity, peers, socket, &Meter::default())?;
+    let addr = endpoint.local_addr()?;
+    let (rings, handle) = servo::rings();
+    let running = servo::thread::Servo::start(rig.servo(rings)).context("no servo thread")?;
+    let (quit, words) = cli::listen(args.follow_stdin)?;
+    let log = Log { json: args.json };
+    log.say(
+        &Event::Listening {
+            addr,
+            fingerprint: identity.fingerprint().to_string(),
+            arm: rig.arm.name(),
+            joints: rig.arm.dof(),
+            lag_s: rig.lag_s(),
+            radius_m: rig.radius_m,
+        },
+        || {
+            format!(
+                "{} ({} joints) listens on {addr}\nfingerprint {}",
+                rig.arm.name(),
+                rig.arm.dof(),
+                identity.fingerprint()
+            )
+        },
+    );
+    let daemon = Daemon {
+        endpoint,
+        clock: HostClock::new(),
+        info: rig.info(),
+        config: SessionConfig::default(),
+        servo: handle,
+        timing: Some(running.timing.clone()),
+    };
+    let (notices, heard) = mpsc::unbounded_channel();
+    let listener = tokio::spawn(listen_to(heard, log, recorder));
+    daemon.run(quit, words, notices).await;
+    let recorder = listener.await.context("the log ended early")?;
+    let (ticks, mean_ns, p99_ns, overruns) = running.timing.read();
+    // The servo outlives everything that could still ask for motion; it ends at rest.
+    drop(running);
+    log.say(&Event::Servo { ticks, mean_ns, p99_ns, overruns }, || {
+        format!(
+            "servo: {ticks} ticks, {:.1} µs mean, {:.1} µs p99, {overruns} late",
+            f64::from(mean_ns) * 1e-3,
+            f64::from(p99_ns) * 1e-3
+        )
+    });
+    match recorder {
+        Some(recorder) => recorder.finish(),
+        None => Ok(()),
+    }
+}
+
+fn read_config(path: &Path) -> anyhow::Result<File> {
+    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    toml::from_str(&text).map_err(|e| anyhow::anyhow!("{}: {e}", path.display()))
+}
+
+#[derive(Clone, Copy)]
+struct Log {
+    json: bool,
+}
+
+impl Log {
+    fn say(self, event: &Event<'_>, text: impl FnOnce() -> String) {
+        if self.json {
+            emit(event);
+        } else {
+            println!("{}", text());
+        }
+    }
+}
+
+async fn listen_to(
+    mut heard: mpsc::UnboundedReceiver<Notice>,
+    log: Log,
+    mut recorder: Option<Recorder>,
+) -> Option<Recorder> {
+    let (mut transitions, mut engagement) = (None, 0);
+    while let Some(notice) = heard.recv().await {
+        match notice {
+            Notice::Report(report) => {
+                if let Some(recorder) = &mut recorder {
+                    recorder.take(&report);
+                }
+                if transitions != Some(report.transitions) {
+                    transitions = Some(report.transitions);
+                    let (state, cause) = (format!("{:?}", report.state), format!("{:?}", report.cause));
+                    let text = format!("{state} ({cause})");
+                    log.say(&Event::State { state, cause, mono_ns: report.at.0 }, || text);
+                }
+                if report.engagement != engagement {
+                    engagement = report.engagement;
+                    log.say(&engaged(&report), || {
+                        format!("engaged #{engagement} at scale {:.3}", report.mapping.scale)
+                    });
+                }
+            }
+            // Engagements count per session.
+            Notice::Connected { epoch, peer } => {
+                log.say(&Event::Connected { epoch, peer }, || format!("operator {peer} (session {epoch})"));
+            }
+            Notice::Disconnected { why, clock, counters } => {
+                let event = Event::Disconnected {
+                    why: &why,
+                    received: counters.received,
+                    dropped: counters.dropped,
+                    clock_offset_s: clock.map(|c| c.0),
+                    clock_bound_s: clock.map(|c| c.1),
+                };
+                log.say(&event, || {
+                    let clock = clock.map_or_else(String::new, |(_, bound_s)| {
+                        format!("; session clock known to ±{:.1} ms", bound_s * 1e3)
+                    });
+                    format!("session ended: {why}; {} motions, {} dropped{clock}", counters.received, counters.dropped)
+                });
+            }
+            Notice::Refused { why } => log.say(&Event::Refused { why: &why }, || format!("refused {why}")),
+            Notice::Path(knots) if log.json => log.say(&Event::Path { knots: &knots }, String::new),
+            Notice::Path(_) => {}
+        }
+    }
+    recorder
+}
+
+fn engaged(report: &Report) -> Event<'static> {
+    let q = report.mapping.rotation.as_ref();
+    Event::Engaged {
+        engagement: report.engagement,
+        mono_ns: report.engaged_at.0,
+        scale: report.mapping.scale,
+        rotation: [q.w, q.i, q.j, q.k],
+        hand_m: report.mapping.hand_m.into(),
+        tip_m: report.mapping.tip_m.into(),
+    }
+}
+
+/// Ticks on their way to the disk; a slow disk loses ticks, never the servo's time.
+const QUEUE: usize = 8192;
+
+/// Writes ticks to a CSV file from a thread of its own.
+struct Recorder {
+    path: PathBuf,
+    queue: SyncSender<Report>,
+    thread: std::thread::JoinHandle<std::io::Result<()>>,
+    lost: u64,
+}
+
+impl Recorder {
+    fn start(path: &Path, dof: usize) -> anyhow::Result<Self> {
+        let file = std::fs::File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
+        let (queue, reports) = sync_channel::<Report>(QUEUE);
+        let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
+            let mut out = std::io::BufWriter::new(file);
+            write!(out, "mono_ns,state,engagement,age_s,clamps,tip_x,tip_y,tip_z,target_x,target_y,target_z")?;
+            (0..dof).try_for_each(|i| write!(out, ",q{i}"))?;
+            writeln!(out)?;
+            for r in reports {
+                write!(out, "{},{:?},{},{:.6},{}", r.at.0, r.state, r.engagement, r.age_s, r.clamps)?;
+                r.tip_m.iter().chain(&r.target_m).try_for_each(|v| write!(out, ",{v:.6}"))?;
+                r.q.iter().take(dof).try_for_each(|v| write!(out, ",{v:.6}"))?;
+                writeln!(out)?;
+            }
+            out.flush()
+        })?;
+        Ok(Self { path: path.to_owned(), queue, thread, lost: 0 })
+    }
+
+    fn take(&mut self, report: &Report) {
+        if let Err(TrySendError::Full(_)) = self.queue.try_send(*report) {
+            self.lost += 1;
+        }
+    }
+
+    fn finish(self) -> anyhow::Result<()> {
+        let Self { path, queue, thread, lost } = self;
+        drop(queue);
+        match thread.join() {
+            Ok(written) => written.with_context(|| format!("cannot write {}", path.display()))?,
+            Err(_) => bail!("the recorder of {} failed", path.display()),
+        }
+        if lost > 0 {
+            eprintln!("note: {lost} ticks are missing in {}: the disk was too slow", path.display());
+        }
+        Ok(())
+    }
+}
