@@ -1,4 +1,9 @@
-//! Telemime operator.
+//! The operator daemon: learns skills from demonstrations, follows the hand, and speaks to the robot
+//! only when the robot's own prediction would go wrong.
 
+pub mod daemon;
 pub mod demonstration;
 pub mod learn;
+pub mod session;
+pub mod skill_file;
+pub mod task;

@@ -7,6 +7,9 @@ pub mod motion;
 pub mod predictor;
 pub mod select;
 mod stats;
+#[cfg(test)]
+mod tests;
+mod trial;
 
 use telemime_protocol::predict::ModelError;
 use telemime_protocol::skill::{Gmm, Provenance, Skill, SkillError, Source};

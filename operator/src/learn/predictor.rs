@@ -4,14 +4,14 @@ use nalgebra::{SMatrix, SVector, Vector3};
 use rand::SeedableRng;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use telemime_protocol::predict::{
-    BLOCK, FEATURES, HandState, KNOT_SPACING_S, MAX_KNOTS, Model, Regression, Standardisation,
-    TARGETS,
+    BLOCK, Calibration, FEATURES, HandState, KNOT_SPACING_S, MAX_KNOTS, Model, Regression,
+    Standardisation, TARGETS,
 };
 use telemime_protocol::time::Stamp;
 
 use super::em::{self, Convergence, EmOptions, add_outer, mirror};
 use super::kmeans::kmeans;
-use super::stats::quantile;
+use super::trial::Trial;
 use super::{LearnError, Progress};
 use crate::demonstration::Demonstration;
 
@@ -25,15 +25,6 @@ const EM_KNOTS: [usize; 3] = [3, 6, 9];
 const LEAST_SPACING_S: f64 = 1.0 / 60.0;
 
 const LLOYD_STEPS: usize = 15;
-
-/// 90 % quantile of χ² with three degrees of freedom.
-const CHI2_3_90: f64 = 6.251;
-
-/// Without a demonstration to hold out: the covariance factor found at 300 ms with three, the largest.
-const UNCALIBRATED: f64 = 2.5;
-
-/// Without a demonstration to hold out: the 90 % quantile of χ² with [`FEATURES`] degrees of freedom.
-const CHI2_15_90: f64 = 22.307;
 
 /// How to train the predictor.
 #[derive(Debug, Clone, PartialEq)]
@@ -73,8 +64,8 @@ struct Row {
 
 /// Trains a predictor and calibrates it by leaving out one demonstration at a time.
 ///
-/// With a single demonstration there is none to leave out: the covariance factor is 2.5 and the
-/// novelty quantile that of χ².
+/// With a single demonstration there is none to leave out, and the guesses of
+/// [`Calibration::UNTRIED`] stay for what only that could show.
 ///
 /// # Errors
 /// [`LearnError`]: no demonstration, too few samples, or numbers that make no model.
@@ -90,36 +81,23 @@ pub fn train(
         .collect();
     let all: Vec<&Row> = rows.iter().flatten().collect();
     let model = fit(&all, None, options, seed)?;
+    let mut trial = Trial::straight(demonstrations, options.knots);
 
     let folds = options.folds.min(demonstrations.len());
-    if folds < 2 {
-        progress(Progress::Predictor {
-            components: model.components().len(),
-            samples: all.len(),
-        });
-        return Ok(model);
-    }
-    let mut errors: Vec<Vec<f64>> = vec![Vec::new(); options.knots];
-    let mut novelties = Vec::new();
-    for fold in 0..folds {
-        let held = fold * demonstrations.len() / folds;
-        let others: Vec<&Row> = rows
-            .iter()
-            .enumerate()
-            .filter(|(i, _)| *i != held)
-            .flat_map(|(_, r)| r)
-            .collect();
-        let trial = fit(&others, None, options, seed)?;
-        try_on(&trial, &demonstrations[held], &mut errors, &mut novelties);
-        progress(Progress::Held {
-            done: fold + 1,
-            of: folds,
-        });
-    }
-    let mut calibration = *model.calibration();
-    for (c, errors) in calibration.iter_mut().zip(errors) {
-        if !errors.is_empty() {
-            *c = (quantile(errors, 0.9) / CHI2_3_90).max(f64::from(f32::MIN_POSITIVE));
+    if folds > 1 {
+        for fold in 0..folds {
+            let held = fold * demonstrations.len() / folds;
+            let others: Vec<&Row> = rows
+                .iter()
+                .enumerate()
+                .filter(|(i, _)| *i != held)
+                .flat_map(|(_, r)| r)
+                .collect();
+            trial.hold_out(&fit(&others, None, options, seed)?, &demonstrations[held]);
+            progress(Progress::Held {
+                done: fold + 1,
+                of: folds,
+            });
         }
     }
     progress(Progress::Predictor {
@@ -130,8 +108,7 @@ pub fn train(
         model.knots(),
         model.standardisation().clone(),
         model.components().to_vec(),
-        calibration,
-        quantile(novelties, 0.9).max(1.0),
+        trial.calibration(),
     )?)
 }
 
@@ -175,7 +152,7 @@ pub fn states(d: &Demonstration) -> impl Iterator<Item = HandState> + '_ {
 }
 
 /// The displacement (m) at knot `j`, from 1; past the end of the recording the hand stays.
-fn displacement(d: &Demonstration, i: usize, j: usize) -> Vector3<f64> {
+pub(super) fn displacement(d: &Demonstration, i: usize, j: usize) -> Vector3<f64> {
     let s = &d.samples()[i];
     d.position_at(s.t_s + j as f64 * KNOT_SPACING_S) - s.position
 }
@@ -199,25 +176,6 @@ fn rows(d: &Demonstration, knots: usize) -> Vec<Row> {
         });
     }
     rows
-}
-
-/// The normalised estimation errors (squared) and novelties of a model on a demonstration it has not seen.
-fn try_on(model: &Model, d: &Demonstration, errors: &mut [Vec<f64>], novelties: &mut Vec<f64>) {
-    let end_s = d.last().t_s + 1e-9;
-    for (i, state) in states(d).enumerate() {
-        let p = model.posterior(&state);
-        novelties.push(p.novelty);
-        let t_s = d.samples()[i].t_s;
-        for (j, errors) in errors.iter_mut().enumerate() {
-            if t_s + (j + 1) as f64 * KNOT_SPACING_S > end_s {
-                break;
-            }
-            let e = p.displacement[j] - displacement(d, i, j + 1);
-            if let Some(c) = p.covariance[j].cholesky() {
-                errors.push(e.dot(&c.solve(&e)));
-            }
-        }
-    }
 }
 
 /// Means, and one scale for each 3-vector.
@@ -306,8 +264,7 @@ fn fit(
         options.knots,
         scaling.features,
         components,
-        [UNCALIBRATED; MAX_KNOTS],
-        CHI2_15_90,
+        Calibration::UNTRIED,
     )?)
 }
 

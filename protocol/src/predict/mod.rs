@@ -9,7 +9,7 @@ mod state;
 
 pub use forecast::{Forecast, Knot, Params, ParamsError, Prediction};
 pub use model::{
-    BLOCK, Model, ModelError, Posterior, Regression, Standardisation, TARGETS, TEMPER,
+    BLOCK, Calibration, Model, ModelError, Posterior, Regression, Standardisation, TARGETS, TEMPER,
 };
 pub use state::{FEATURES, HandState, MEMORY_TAU_S};
 
@@ -18,3 +18,6 @@ pub const MAX_KNOTS: usize = 24;
 
 /// Time between knots, s: one frame of a Kinect.
 pub const KNOT_SPACING_S: f64 = 1.0 / 30.0;
+
+#[cfg(test)]
+mod tests;

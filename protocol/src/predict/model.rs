@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
 use super::state::{FEATURES, HandState};
-use super::{Forecast, MAX_KNOTS, Params};
+use super::{Forecast, KNOT_SPACING_S, MAX_KNOTS, Params, ParamsError};
 use crate::skill::MAX_COMPONENTS;
 use crate::skill::gmm::{softmax, solve_lower};
 
@@ -46,6 +46,9 @@ pub enum ModelError {
         /// Where.
         field: &'static str,
     },
+    /// A parameter is outside its range.
+    #[error(transparent)]
+    Params(#[from] ParamsError),
     /// A residual covariance has a negative variance.
     #[error("predictor component {component}: a residual variance is negative")]
     NegativeVariance {
@@ -91,6 +94,40 @@ pub struct Posterior {
     pub novelty: f64,
 }
 
+/// What trying the predictor on motion it was not trained on has shown.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Calibration {
+    /// Factors c_h on the mixture's covariance, one a knot, > 0.
+    pub covariance: [f64; MAX_KNOTS],
+    /// Mean squared error of constant velocity along one axis, one a knot, m², > 0.
+    pub straight_m2: [f64; MAX_KNOTS],
+    /// The 90 % quantile of the novelty, > 0.
+    pub novelty90: f64,
+    /// The parameters that did best: where the operator's adaptation starts.
+    pub params: Params,
+}
+
+impl Calibration {
+    /// What to assume before anything was tried: the covariance factor that three demonstrations of a
+    /// Kinect gesture need at 300 ms, constant velocity wrong by its own spread of 0.5 m/s, and the
+    /// 90 % quantile of χ² with [`FEATURES`] degrees of freedom.
+    pub const UNTRIED: Self = {
+        let mut straight_m2 = [0.0; MAX_KNOTS];
+        let mut j = 0;
+        while j < MAX_KNOTS {
+            let error_m = 0.5 * (j + 1) as f64 * KNOT_SPACING_S;
+            straight_m2[j] = error_m * error_m;
+            j += 1;
+        }
+        Self {
+            covariance: [2.5; MAX_KNOTS],
+            straight_m2,
+            novelty90: 22.307,
+            params: Params::DEFAULT,
+        }
+    };
+}
+
 /// A learned predictor of at most 64 components and [`MAX_KNOTS`] knots, checked on construction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Model {
@@ -99,13 +136,11 @@ pub struct Model {
     components: Vec<Regression>,
     /// ln π − Σ ln Lᵢᵢ of each component.
     log_scale: Vec<f64>,
-    calibration: [f64; MAX_KNOTS],
-    novelty90: f64,
+    calibration: Calibration,
 }
 
 impl Model {
-    /// Checks a predictor with `knots` knots, `calibration` factors of the covariance at each, and the
-    /// 90 % quantile of the novelty that held-out motion of the same skill shows.
+    /// Checks a predictor with `knots` knots; what its parts hold beyond them is not used.
     ///
     /// # Errors
     /// [`ModelError`], one variant a cause.
@@ -113,8 +148,7 @@ impl Model {
         knots: usize,
         standardisation: Standardisation,
         components: Vec<Regression>,
-        calibration: [f64; MAX_KNOTS],
-        novelty90: f64,
+        calibration: Calibration,
     ) -> Result<Self, ModelError> {
         if !(1..=MAX_KNOTS).contains(&knots) {
             return Err(ModelError::Knots { found: knots });
@@ -126,8 +160,10 @@ impl Model {
         }
         finite("a feature mean", standardisation.mean.iter())?;
         positive("a feature scale", standardisation.scale.iter())?;
-        positive("a calibration factor", calibration.iter())?;
-        positive("the novelty quantile", [novelty90].iter())?;
+        positive("a covariance factor", calibration.covariance.iter())?;
+        positive("a mean squared error", calibration.straight_m2.iter())?;
+        positive("the novelty quantile", [calibration.novelty90].iter())?;
+        calibration.params.checked()?;
         let mut log_scale = Vec::with_capacity(components.len());
         for (component, c) in components.iter().enumerate() {
             positive("a weight", [c.weight].iter())?;
@@ -152,11 +188,10 @@ impl Model {
             components,
             log_scale,
             calibration,
-            novelty90,
         })
     }
 
-    /// Number of knots J; the last is J·[`super::KNOT_SPACING_S`] ahead.
+    /// Number of knots J; the last is J·[`KNOT_SPACING_S`] ahead.
     pub fn knots(&self) -> usize {
         self.knots
     }
@@ -171,14 +206,9 @@ impl Model {
         &self.components
     }
 
-    /// Factors c_h on the covariance, one a knot, found on demonstrations left out of the training.
-    pub fn calibration(&self) -> &[f64; MAX_KNOTS] {
+    /// What held-out motion has shown.
+    pub fn calibration(&self) -> &Calibration {
         &self.calibration
-    }
-
-    /// The 90 % quantile of the novelty of held-out motion.
-    pub fn novelty90(&self) -> f64 {
-        self.novelty90
     }
 
     /// Predicts from `state` by this mixture, blended with constant velocity where the motion is new.

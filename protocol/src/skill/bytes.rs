@@ -8,7 +8,8 @@ use super::{
     Stats, sha256,
 };
 use crate::predict::{
-    BLOCK, FEATURES, MAX_KNOTS, Model, ModelError, Regression, Standardisation, TARGETS,
+    BLOCK, Calibration, FEATURES, MAX_KNOTS, Model, ModelError, Params, Regression,
+    Standardisation, TARGETS,
 };
 use crate::wire::codec::{self, DecodeError};
 
@@ -38,8 +39,10 @@ struct RawModel {
     mean: [f32; FEATURES],
     scale: [f32; FEATURES],
     /// One factor a knot: its length is the number of knots.
-    calibration: Vec<f32>,
+    covariance: Vec<f32>,
+    straight_m2: Vec<f32>,
     novelty90: f32,
+    params: [f32; 3],
     components: Vec<RawRegression>,
 }
 
@@ -169,12 +172,16 @@ fn check_provenance(provenance: &Provenance) -> Result<(), SkillError> {
 
 fn pack(model: &Model) -> RawModel {
     let knots = model.knots();
+    let calibration = model.calibration();
+    let params = calibration.params;
     let narrow = |v: &[f64]| v.iter().map(|&v| v as f32).collect::<Vec<_>>();
     RawModel {
         mean: model.standardisation().mean.map(|v| v as f32).into(),
         scale: model.standardisation().scale.map(|v| v as f32).into(),
-        calibration: narrow(&model.calibration()[..knots]),
-        novelty90: model.novelty90() as f32,
+        covariance: narrow(&calibration.covariance[..knots]),
+        straight_m2: narrow(&calibration.straight_m2[..knots]),
+        novelty90: calibration.novelty90 as f32,
+        params: [params.gain, params.trust, params.cv_damping].map(|v| v as f32),
         components: model
             .components()
             .iter()
@@ -195,12 +202,26 @@ fn pack(model: &Model) -> RawModel {
 }
 
 fn unpack(raw: &RawModel) -> Result<Model, SkillError> {
-    let knots = raw.calibration.len();
+    let knots = raw.covariance.len();
     if !(1..=MAX_KNOTS).contains(&knots) {
         return Err(ModelError::Knots { found: knots }.into());
     }
-    let mut calibration = [1.0; MAX_KNOTS];
-    widen(&mut calibration[..knots], &raw.calibration);
+    if raw.straight_m2.len() != knots {
+        return Err(wrong_length("straight").into());
+    }
+    let [gain, trust, cv_damping] = raw.params.map(f64::from);
+    let mut calibration = Calibration {
+        covariance: [1.0; MAX_KNOTS],
+        straight_m2: [1.0; MAX_KNOTS],
+        novelty90: f64::from(raw.novelty90),
+        params: Params {
+            gain,
+            trust,
+            cv_damping,
+        },
+    };
+    widen(&mut calibration.covariance, &raw.covariance);
+    widen(&mut calibration.straight_m2, &raw.straight_m2);
     let components = raw
         .components
         .iter()
@@ -214,27 +235,22 @@ fn unpack(raw: &RawModel) -> Result<Model, SkillError> {
         },
         components,
         calibration,
-        f64::from(raw.novelty90),
     )?)
 }
 
 fn unpack_regression(raw: &RawRegression, knots: usize) -> Result<Regression, DecodeError> {
-    let wrong = |field| DecodeError::Invalid {
-        field,
-        why: "its length does not fit the number of knots",
-    };
     let row = 3 * knots;
     if raw.factor.len() != TRIANGLE {
-        return Err(wrong("factor"));
+        return Err(wrong_length("factor"));
     }
     if raw.target.len() != row {
-        return Err(wrong("target"));
+        return Err(wrong_length("target"));
     }
     if raw.gain.len() != FEATURES * row {
-        return Err(wrong("gain"));
+        return Err(wrong_length("gain"));
     }
     if raw.residual.len() != knots * BLOCK {
-        return Err(wrong("residual"));
+        return Err(wrong_length("residual"));
     }
     let mut out = Regression {
         weight: f64::from(raw.weight),
@@ -253,6 +269,13 @@ fn unpack_regression(raw: &RawRegression, knots: usize) -> Result<Regression, De
     }
     widen(out.residual.as_flattened_mut(), &raw.residual);
     Ok(out)
+}
+
+fn wrong_length(field: &'static str) -> DecodeError {
+    DecodeError::Invalid {
+        field,
+        why: "its length does not fit the number of knots",
+    }
 }
 
 fn widen(to: &mut [f64], from: &[f32]) {

@@ -202,6 +202,9 @@ impl Skill {
     }
 }
 
+#[cfg(test)]
+pub(crate) mod tests;
+
 fn sha256(bytes: &[u8]) -> [u8; 32] {
     Sha256::digest(bytes).into()
 }

@@ -1,3 +1,11 @@
-//! The wire: one codec, versions, messages. `docs/protocol.md` is the normative text.
+//! The wire: one codec, a frozen greeting, framing, and one set of messages per version.
+//! `docs/protocol.md` is the normative text.
 
 pub mod codec;
+pub mod frame;
+pub mod hello;
+pub mod knots;
+pub mod state;
+pub mod v1;
+
+pub use codec::DecodeError;

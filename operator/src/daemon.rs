@@ -1,0 +1,358 @@
+//! The operator's shell: dials, redials, feeds the session samples and moves its bytes.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use quinn::{Connection, Endpoint, SendStream, VarInt};
+use telemime_endpoint::control::{Control, ControlError, write_frame};
+use telemime_endpoint::meter::Counts;
+use telemime_endpoint::{HostClock, Meter, Mono, quic};
+use telemime_protocol::skill::Skill;
+use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::DecodeError;
+use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
+use telemime_protocol::wire::v1;
+use tokio::sync::{mpsc, watch};
+use tokio::time::{sleep_until, timeout};
+
+use crate::session::{Counters, Event, Output, Session, SessionConfig};
+use crate::task::{Advice, Outcome, Task};
+
+/// The first attempt to connect is given this long; later ones twice as long each.
+const FIRST_ATTEMPT: Duration = Duration::from_secs(1);
+const LONGEST_ATTEMPT: Duration = Duration::from_secs(10);
+
+/// Pause between attempts.
+const REDIAL_S: f64 = 0.25;
+
+/// What the daemon needs.
+#[derive(Debug)]
+pub struct Daemon {
+    /// A client endpoint whose default settings pin the robot's key.
+    pub endpoint: Endpoint,
+    /// Counts the endpoint's traffic.
+    pub meter: Meter,
+    /// The robot.
+    pub robot: SocketAddr,
+    /// Mono clock of the host; the session clock counts from `epoch` on it.
+    pub clock: HostClock,
+    /// Zero of the session clock.
+    pub epoch: Mono,
+    /// What to predict with.
+    pub skill: Option<Arc<Skill>>,
+    /// Session settings.
+    pub config: SessionConfig,
+    /// Give up if the first connection takes longer than this.
+    pub patience: Duration,
+}
+
+/// Why the daemon ended without doing its task.
+#[derive(Debug, thiserror::Error)]
+pub enum DaemonError {
+    /// The robot could not be reached at all.
+    #[error("cannot reach the robot at {addr}: {why}")]
+    Unreachable {
+        /// Its address.
+        addr: SocketAddr,
+        /// The last attempt's error.
+        why: String,
+    },
+    /// The robot declined the session.
+    #[error("the robot at {addr} declines: {text}")]
+    Rejected {
+        /// Its address.
+        addr: SocketAddr,
+        /// Why, for machines.
+        code: RejectCode,
+        /// Why, for people.
+        text: String,
+    },
+}
+
+/// What there is to know afterwards.
+#[derive(Debug, Clone)]
+pub struct Summary {
+    /// How the task ended.
+    pub outcome: Outcome,
+    /// Sums over all sessions.
+    pub counters: Counters,
+    /// Traffic from first packet to last.
+    pub total: Counts,
+    /// Traffic from engage to release.
+    pub engaged: Counts,
+    /// Sessions begun.
+    pub sessions: u32,
+}
+
+/// Something for a log or a progress bar.
+#[derive(Debug, Clone)]
+pub enum Notice {
+    /// An attempt to connect failed and will be repeated.
+    Dialling {
+        /// Why.
+        why: String,
+    },
+    /// A session began.
+    Connected {
+        /// Its epoch.
+        epoch: u32,
+    },
+    /// The connection was lost.
+    Lost {
+        /// Why.
+        why: String,
+    },
+    /// Something happened in the session, at this time of the session clock.
+    Event(Stamp, Event),
+    /// The scale the next engagement uses, and ε_path, m.
+    Mapping {
+        /// Tip metres per hand metre.
+        scale: f64,
+        /// ε_path, m.
+        path_bound_m: f64,
+        /// The robot.
+        robot: String,
+    },
+}
+
+struct Link {
+    connection: Connection,
+    send: SendStream,
+    frames: mpsc::Receiver<Result<Frame, ControlError>>,
+    epoch: u32,
+}
+
+enum DialError {
+    Again(String),
+    Rejected { code: RejectCode, text: String },
+}
+
+enum End {
+    Finished,
+    Quit,
+    Lost(String),
+}
+
+impl Daemon {
+    /// Runs `task` to its end, or until `quit` turns true. The arm is released in every case.
+    ///
+    /// # Errors
+    /// [`DaemonError`] if there was no session at all.
+    pub async fn run(
+        &self,
+        task: &mut Task,
+        mut quit: watch::Receiver<bool>,
+        notices: &mpsc::UnboundedSender<Notice>,
+    ) -> Result<Summary, DaemonError> {
+        let mut summary = Summary {
+            outcome: Outcome::Interrupted("never connected".into()),
+            counters: Counters::default(),
+            total: Counts::default(),
+            engaged: Counts::default(),
+            sessions: 0,
+        };
+        let mut marks = Marks::default();
+        loop {
+            let link = tokio::select! {
+                biased;
+                _ = quit.wait_for(|quit| *quit) => break,
+                link = self.dial(summary.sessions == 0, task, notices) => link?,
+            };
+            let Some(link) = link else { break };
+            summary.sessions += 1;
+            let _ = notices.send(Notice::Connected { epoch: link.epoch });
+            let mut session = Session::new(self.config, self.skill.clone(), link.epoch);
+            let end = self.drive(&mut session, link, task, &mut quit, notices, &mut marks).await;
+            summary.counters.add(session.counters());
+            match end {
+                End::Finished | End::Quit => break,
+                End::Lost(why) => {
+                    task.on_lost(&why);
+                    let _ = notices.send(Notice::Lost { why });
+                }
+            }
+        }
+        self.endpoint.wait_idle().await;
+        summary.outcome = task.outcome(*quit.borrow());
+        summary.total = self.meter.counts();
+        summary.engaged = marks.span(summary.total);
+        Ok(summary)
+    }
+
+    fn now(&self) -> Stamp {
+        Stamp(self.clock.now().0 - self.epoch.0)
+    }
+
+    fn instant(&self, at: Stamp) -> tokio::time::Instant {
+        self.clock.instant(Mono(at.0.saturating_add(self.epoch.0)))
+    }
+
+    /// Dials until there is a session; `None` once the task is over anyway.
+    async fn dial(
+        &self,
+        first: bool,
+        task: &Task,
+        notices: &mpsc::UnboundedSender<Notice>,
+    ) -> Result<Option<Link>, DaemonError> {
+        let begun = self.now();
+        let mut attempt = FIRST_ATTEMPT;
+        loop {
+            let dialled = timeout(attempt, self.connect()).await;
+            attempt = (attempt * 2).min(LONGEST_ATTEMPT);
+            let why = match dialled {
+                Ok(Ok(link)) => return Ok(Some(link)),
+                // An operator that lost its link may find its own old session still in authority.
+                Ok(Err(DialError::Rejected { code: RejectCode::Busy, text })) if !first => text,
+                Ok(Err(DialError::Rejected { code, text })) => {
+                    return Err(DaemonError::Rejected { addr: self.robot, code, text });
+                }
+                Ok(Err(DialError::Again(why))) => why,
+                Err(_) => "no answer: is the robot running, and does UDP reach it?".to_owned(),
+            };
+            if first && self.now().secs_since(begun) > self.patience.as_secs_f64() {
+                return Err(DaemonError::Unreachable { addr: self.robot, why });
+            }
+            if task.is_over(self.now()) {
+                return Ok(None);
+            }
+            let _ = notices.send(Notice::Dialling { why });
+            sleep_until(self.instant(self.now().offset_by_secs(REDIAL_S))).await;
+        }
+    }
+
+    async fn connect(&self) -> Result<Link, DialError> {
+        let again = |e: ControlError| DialError::Again(e.to_string());
+        let connecting =
+            self.endpoint.connect(self.robot, "telemime").map_err(|e| DialError::Again(e.to_string()))?;
+        let connection = connecting.await.map_err(|e| DialError::Again(quic::explain(&e)))?;
+        let mut control = Control::open(&connection).await.map_err(again)?;
+        let hello = Hello { min: v1::VERSION, max: v1::VERSION, features: 0 };
+        control.write(&hello.encode()).await.map_err(again)?;
+        match control.answer().await.map_err(again)? {
+            Answer::Ack { version: v1::VERSION, epoch, .. } => {
+                let (send, frames) = control.into_frames();
+                Ok(Link { connection, send, frames, epoch })
+            }
+            Answer::Ack { version, .. } => Err(DialError::Rejected {
+                code: RejectCode::Version,
+                text: format!("it answers with version {version}, which we did not offer"),
+            }),
+            Answer::Reject { code, text } => Err(DialError::Rejected { code, text }),
+        }
+    }
+
+    async fn drive(
+        &self,
+        session: &mut Session,
+        mut link: Link,
+        task: &mut Task,
+        quit: &mut watch::Receiver<bool>,
+        notices: &mpsc::UnboundedSender<Notice>,
+        marks: &mut Marks,
+    ) -> End {
+        loop {
+            if let Err(e) = self.flush(session, &mut link).await {
+                return End::Lost(e.to_string());
+            }
+            let now = self.now();
+            while let Some(event) = session.poll_event() {
+                if matches!(event, Event::Ready) {
+                    let robot = session.info().map_or_else(String::new, |info| info.name.clone());
+                    let scale = session.scale().unwrap_or_default();
+                    let path_bound_m = session.path_bound_m();
+                    let _ = notices.send(Notice::Mapping { scale, path_bound_m, robot });
+                }
+                match &event {
+                    Event::Engaged { .. } => marks.engaged.get_or_insert(self.meter.counts()),
+                    _ => &mut Counts::default(),
+                };
+                task.on_event(now, &event);
+                let _ = notices.send(Notice::Event(now, event));
+            }
+            if task.advise(now, session) == Advice::Finished {
+                marks.released = Some(self.meter.counts());
+                return self.leave(session, link).await;
+            }
+            if task.has_released() {
+                marks.released.get_or_insert(self.meter.counts());
+            }
+            if let Err(e) = self.flush(session, &mut link).await {
+                return End::Lost(e.to_string());
+            }
+            let due = [session.poll_timeout().map(|(at, _)| at), task.poll_timeout()];
+            let due = due.into_iter().flatten().min();
+            tokio::select! {
+                biased;
+                _ = quit.wait_for(|quit| *quit) => {
+                    let _ = self.leave(session, link).await;
+                    return End::Quit;
+                }
+                frame = link.frames.recv() => match frame {
+                    Some(Ok(frame)) => {
+                        if let Err(e) = session.handle_control(self.now(), &frame) {
+                            return End::Lost(malformed(&link.connection, &e));
+                        }
+                    }
+                    Some(Err(e)) => return End::Lost(e.to_string()),
+                    None => return End::Lost("control stream ended".into()),
+                },
+                datagram = link.connection.read_datagram() => match datagram {
+                    Ok(bytes) => session.handle_datagram(self.now(), &bytes),
+                    Err(e) => return End::Lost(quic::explain(&e)),
+                },
+                () = sleep_until(self.instant(due.unwrap_or(now))), if due.is_some() => {
+                    let now = self.now();
+                    session.handle_timeout(now);
+                }
+            }
+        }
+    }
+
+    async fn flush(&self, session: &mut Session, link: &mut Link) -> Result<(), ControlError> {
+        while let Some(output) = session.poll_output() {
+            match output {
+                Output::Control(payload) => write_frame(&mut link.send, &payload).await?,
+                Output::Datagram { bytes, motion } => {
+                    if motion {
+                        self.meter.mark_motion(bytes.len());
+                    }
+                    // Too large or unsupported cannot happen (1100 B); a lost connection shows up elsewhere.
+                    let _ = link.connection.send_datagram(bytes.into());
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Releases, says goodbye, and waits until the robot has read it.
+    async fn leave(&self, session: &mut Session, mut link: Link) -> End {
+        session.goodbye();
+        if self.flush(session, &mut link).await.is_ok() {
+            let _ = link.send.finish();
+            let _ = timeout(Duration::from_secs(1), link.send.stopped()).await;
+        }
+        link.connection.close(VarInt::from_u32(0), b"goodbye");
+        End::Finished
+    }
+}
+
+fn malformed(connection: &Connection, error: &DecodeError) -> String {
+    connection.close(VarInt::from_u32(1), b"malformed control message");
+    format!("the robot sent a malformed message: {error}")
+}
+
+/// Traffic at the first engage and at the release.
+#[derive(Debug, Default)]
+struct Marks {
+    engaged: Option<Counts>,
+    released: Option<Counts>,
+}
+
+impl Marks {
+    fn span(&self, total: Counts) -> Counts {
+        let Some(from) = self.engaged else { return Counts::default() };
+        self.released.unwrap_or(total).since(from)
+    }
+}

@@ -1,0 +1,162 @@
+//! What a predictor is worth on motion it has not seen: errors collected, calibration drawn from them.
+
+use nalgebra::Vector3;
+use telemime_protocol::predict::{Calibration, KNOT_SPACING_S, MAX_KNOTS, Model, Params};
+
+use super::predictor::{displacement, states};
+use super::stats::quantile;
+use crate::demonstration::Demonstration;
+
+/// 90 % quantile of χ² with three degrees of freedom.
+const CHI2_3_90: f64 = 6.251;
+
+/// Variances and novelties below these are a sensor at rest, not precision: m², and none.
+const LEAST_M2: f64 = 1e-8;
+const LEAST_NOVELTY: f64 = 1.0;
+
+/// Knots (from 1) by whose errors the parameters are chosen: 100 to 300 ms, where predictions are used.
+const CHOSEN_BY: std::ops::RangeInclusive<usize> = 3..=9;
+
+/// A scalar least-squares problem `min Σ|b − s·a|²`.
+#[derive(Clone, Copy, Default)]
+struct Slope {
+    ab: f64,
+    aa: f64,
+}
+
+impl Slope {
+    fn add(&mut self, a: &Vector3<f64>, b: &Vector3<f64>, weight: f64) {
+        self.ab += weight * a.dot(b);
+        self.aa += weight * a.norm_squared();
+    }
+
+    /// The best s in [0, 1]; `otherwise` if there is nothing to go by.
+    fn solve(&self, otherwise: f64) -> f64 {
+        let s = self.ab / self.aa;
+        if s.is_finite() {
+            s.clamp(0.0, 1.0)
+        } else {
+            otherwise
+        }
+    }
+}
+
+/// The trials of one training.
+pub(super) struct Trial {
+    knots: usize,
+    damping: f64,
+    straight_m2: [f64; MAX_KNOTS],
+    /// Σ|truth|² at each knot, by which errors at different horizons are made comparable.
+    moved_m2: [f64; MAX_KNOTS],
+    trust: Slope,
+    nees: Vec<Vec<f64>>,
+    novelties: Vec<f64>,
+}
+
+impl Trial {
+    /// Tries constant velocity, which needs no training and so nothing held out.
+    pub(super) fn straight(demonstrations: &[Demonstration], knots: usize) -> Self {
+        let mut moved_m2 = [0.0; MAX_KNOTS];
+        visit(demonstrations, knots, |j, _, truth| {
+            moved_m2[j - 1] += truth.norm_squared();
+        });
+        let mut damping = Slope::default();
+        visit(demonstrations, knots, |j, straight, truth| {
+            if CHOSEN_BY.contains(&j) {
+                damping.add(straight, truth, share(&moved_m2, j));
+            }
+        });
+        let damping = damping.solve(Params::DEFAULT.cv_damping);
+        let mut squared = [0.0; MAX_KNOTS];
+        let mut count = [0_u32; MAX_KNOTS];
+        visit(demonstrations, knots, |j, straight, truth| {
+            squared[j - 1] += (straight * damping - truth).norm_squared();
+            count[j - 1] += 1;
+        });
+        let mut straight_m2 = Calibration::UNTRIED.straight_m2;
+        for ((v, sum), count) in straight_m2.iter_mut().zip(squared).zip(count) {
+            if count > 0 {
+                *v = (sum / (3.0 * f64::from(count))).max(LEAST_M2);
+            }
+        }
+        Self {
+            knots,
+            damping,
+            straight_m2,
+            moved_m2,
+            trust: Slope::default(),
+            nees: vec![Vec::new(); knots],
+            novelties: Vec::new(),
+        }
+    }
+
+    /// Tries a model on a demonstration it was not trained on.
+    pub(super) fn hold_out(&mut self, model: &Model, d: &Demonstration) {
+        let end_s = d.last().t_s + 1e-9;
+        for (i, state) in states(d).enumerate() {
+            let p = model.posterior(&state);
+            self.novelties.push(p.novelty);
+            let velocity = state.motion().0 * self.damping;
+            for j in 1..=self.knots {
+                let h_s = j as f64 * KNOT_SPACING_S;
+                if d.samples()[i].t_s + h_s > end_s {
+                    break;
+                }
+                let truth = displacement(d, i, j);
+                let e = p.displacement[j - 1] - truth;
+                if let Some(c) = p.covariance[j - 1].cholesky() {
+                    self.nees[j - 1].push(e.dot(&c.solve(&e)));
+                }
+                if CHOSEN_BY.contains(&j) {
+                    let straight = velocity * h_s;
+                    let apart = p.displacement[j - 1] - straight;
+                    let weight = share(&self.moved_m2, j);
+                    self.trust.add(&apart, &(truth - straight), weight);
+                }
+            }
+        }
+    }
+
+    /// `c_h = q₉₀(NEES)/6.251`; trust and damping by least squares.
+    pub(super) fn calibration(self) -> Calibration {
+        let mut c = Calibration::UNTRIED;
+        c.straight_m2 = self.straight_m2;
+        c.params.cv_damping = self.damping;
+        c.params.trust = self.trust.solve(Params::DEFAULT.trust);
+        if !self.novelties.is_empty() {
+            c.novelty90 = quantile(self.novelties, 0.9).max(LEAST_NOVELTY);
+        }
+        for (factor, nees) in c.covariance.iter_mut().zip(self.nees) {
+            if !nees.is_empty() {
+                *factor = (quantile(nees, 0.9) / CHI2_3_90).max(f64::from(f32::MIN_POSITIVE));
+            }
+        }
+        c
+    }
+}
+
+/// The weight of an error at knot `j`: relative to how far the hand moves in that time.
+fn share(moved_m2: &[f64; MAX_KNOTS], j: usize) -> f64 {
+    1.0 / moved_m2[j - 1].max(LEAST_M2)
+}
+
+/// Calls `each(knot, undamped constant velocity, truth)`, displacements in m, for every moment and knot.
+fn visit(
+    demonstrations: &[Demonstration],
+    knots: usize,
+    mut each: impl FnMut(usize, &Vector3<f64>, &Vector3<f64>),
+) {
+    for d in demonstrations {
+        let end_s = d.last().t_s + 1e-9;
+        for (i, state) in states(d).enumerate() {
+            let (velocity, _) = state.motion();
+            for j in 1..=knots {
+                let h_s = j as f64 * KNOT_SPACING_S;
+                if d.samples()[i].t_s + h_s > end_s {
+                    break;
+                }
+                each(j, &(velocity * h_s), &displacement(d, i, j));
+            }
+        }
+    }
+}

@@ -1,0 +1,146 @@
+//! Mirror: dual prediction for the future, the live path coder for the past.
+
+use std::collections::VecDeque;
+
+use telemime_protocol::checkpoint::CheckpointError;
+use telemime_protocol::checkpoint::path::{PathEncoder, PathKnot};
+use telemime_protocol::predict::{Forecast, HandState, Params};
+use telemime_protocol::skill::Skill;
+use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::knots;
+use telemime_protocol::wire::state::WireState;
+use telemime_protocol::wire::v1::{Motion, WireParams, model_tag};
+
+use super::adapt::Adaptation;
+use super::FutureBound;
+
+/// Knots in one message; the oldest unacknowledged first.
+const KNOTS_PER_MESSAGE: usize = 24;
+
+/// Unacknowledged knots held; beyond, the path is given up and starts afresh.
+const MAX_UNACKNOWLEDGED: usize = 512;
+
+/// Every so many messages the robot's prediction is checked against ours.
+const KEYFRAME: u32 = 8;
+
+/// A future bound below this makes no sense: the state itself is quantised, m.
+const LEAST_FUTURE_BOUND_M: f64 = 1e-3;
+
+/// A live engagement.
+pub(super) struct Mirror {
+    hand: HandState,
+    path: PathEncoder,
+    unacknowledged: VecDeque<PathKnot>,
+    first_unacknowledged: u32,
+    adaptation: Adaptation,
+    without_model: bool,
+    newest: Option<Forecast>,
+    sent: Option<Forecast>,
+    messages: u32,
+}
+
+impl Mirror {
+    pub(super) fn new(hand: HandState, path_bound_m: f64, gain: f64) -> Result<Self, CheckpointError> {
+        // The bound both ends derive their grid from is a whole number of µm.
+        let path_bound_m = (path_bound_m * 1e6).round() * 1e-6;
+        Ok(Self {
+            hand,
+            path: PathEncoder::new(path_bound_m)?,
+            unacknowledged: VecDeque::new(),
+            first_unacknowledged: 0,
+            adaptation: Adaptation::new(gain),
+            without_model: false,
+            newest: None,
+            sent: None,
+            messages: 0,
+        })
+    }
+
+    /// What an engage request carries.
+    pub(super) fn reference(&self, skill: Option<&Skill>) -> Option<(WireState, u16, WireParams)> {
+        let state = WireState::quantise(&self.hand)?;
+        Some((state, self.model(skill), WireParams::quantise(&self.adaptation.params())))
+    }
+
+    pub(super) fn go_without_model(&mut self) {
+        self.without_model = true;
+    }
+
+    /// The robot holds every knot before `frontier`.
+    pub(super) fn acknowledge(&mut self, frontier: u32) {
+        let known = frontier.saturating_sub(self.first_unacknowledged) as usize;
+        let known = known.min(self.unacknowledged.len());
+        self.unacknowledged.drain(..known);
+        self.first_unacknowledged += known as u32;
+    }
+
+    /// Takes the newest hand state; `horizon_s` is how far ahead the robot will have to look.
+    /// Says whether a knot was made.
+    pub(super) fn take(
+        &mut self,
+        previous: &HandState,
+        hand: HandState,
+        skill: Option<&Skill>,
+        horizon_s: f64,
+    ) -> bool {
+        self.hand = hand;
+        let skill = skill.filter(|_| !self.without_model);
+        self.adaptation.observe(previous, &hand, skill.map(Skill::predictor), horizon_s);
+        self.newest = self.predict(skill);
+        // A sample the path cannot hold (out of the grid's range) is still good for the future.
+        let Ok(Some(knot)) = self.path.push(hand.t, hand.x) else { return false };
+        if self.unacknowledged.len() == MAX_UNACKNOWLEDGED {
+            self.unacknowledged.pop_front();
+            self.first_unacknowledged += 1;
+        }
+        self.unacknowledged.push_back(knot);
+        true
+    }
+
+    /// Whether the robot's prediction for `arrival` would differ by more than the bound.
+    pub(super) fn future_changed(&self, arrival: Stamp, bound: FutureBound) -> bool {
+        let (Some(sent), Some(newest)) = (&self.sent, &self.newest) else { return true };
+        let (held, known) = (sent.at(arrival.secs_since(sent.t)), newest.at(arrival.secs_since(newest.t)));
+        let bound_m = match bound {
+            FutureBound::Absolute(bound_m) => bound_m,
+            FutureBound::Relative(factor) => factor * known.sigma_m,
+        };
+        (held.position - known.position).norm() > bound_m.max(LEAST_FUTURE_BOUND_M)
+    }
+
+    /// The next message but for its envelope; `None` if the hand is nowhere that can be sent.
+    pub(super) fn motion(&mut self, skill: Option<&Skill>) -> Option<Motion> {
+        let skill = skill.filter(|_| !self.without_model);
+        let state = WireState::quantise(&self.hand)?;
+        self.messages += 1;
+        let forecast = self.predict(skill)?;
+        self.sent = Some(forecast);
+        let due: Vec<_> = self.unacknowledged.iter().take(KNOTS_PER_MESSAGE).copied().collect();
+        Some(Motion {
+            epoch: 0,
+            engagement: 0,
+            seq: 0,
+            lease_ms: 0,
+            model: self.model(skill),
+            params: WireParams::quantise(&self.adaptation.params()),
+            checksum: (self.messages % KEYFRAME == 1).then(|| forecast.checksum()),
+            state,
+            first_knot: self.first_unacknowledged,
+            knots: knots::pack(&state, self.path.grid(), &due).unwrap_or_default(),
+        })
+    }
+
+    fn model(&self, skill: Option<&Skill>) -> u16 {
+        skill.filter(|_| !self.without_model).map_or(0, |skill| model_tag(&skill.id().0))
+    }
+
+    /// What the robot would predict if it were sent the newest state now: from the numbers as they travel.
+    fn predict(&self, skill: Option<&Skill>) -> Option<Forecast> {
+        let state = WireState::quantise(&self.hand)?.dequantise();
+        let params: Params = WireParams::quantise(&self.adaptation.params()).dequantise();
+        Some(match skill {
+            Some(skill) => skill.predictor().forecast(&state, &params),
+            None => Forecast::constant_velocity(&state, &params),
+        })
+    }
+}

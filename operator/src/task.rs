@@ -1,0 +1,264 @@
+//! What the operator is to do: replay a recording as if the hand were there, or play a skill.
+
+use nalgebra::Vector3;
+use telemime_protocol::checkpoint::Plan;
+use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::v1::{Cause, Refusal, RobotState};
+
+use crate::session::{Event, HandSample, Session};
+
+/// Pause before a declined request is made again, s.
+const RETRY_S: f64 = 0.05;
+
+/// Requests made before giving up.
+const MAX_REQUESTS: u32 = 100;
+
+/// The arm gets this long to come to rest before the operator leaves, s.
+const LEAVE_S: f64 = 0.6;
+
+/// How a task ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Outcome {
+    /// Done.
+    Completed,
+    /// Not done, and why.
+    Interrupted(String),
+}
+
+/// What the shell should do next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Advice {
+    /// Go on.
+    Continue,
+    /// The task is over: leave.
+    Finished,
+}
+
+/// A recording with its own time, s from 0.
+#[derive(Debug, Clone)]
+pub struct Recording {
+    /// Time (s) and position (m), in order.
+    pub samples: Vec<(f64, Vector3<f64>)>,
+    /// The hand rests at the first position for this long before the recording begins, s: one engages at rest.
+    pub rest_s: f64,
+}
+
+enum Work {
+    Replay { recording: Recording, next: usize },
+    Play { plan: Plan<3> },
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Phase {
+    /// Not yet asked, or to be asked again at this time.
+    Waiting(Option<Stamp>),
+    Asked,
+    Engaged,
+    /// Released; leave at this time.
+    Leaving(Stamp),
+    Over,
+}
+
+/// A task in progress.
+pub struct Task {
+    work: Work,
+    phase: Phase,
+    /// When the recording's rest began.
+    started: Option<Stamp>,
+    engaged_at: Option<Stamp>,
+    requests: u32,
+    trouble: Option<String>,
+}
+
+impl Task {
+    /// Replays `recording` at its own speed.
+    pub fn replay(recording: Recording) -> Self {
+        Self::new(Work::Replay { recording, next: 0 })
+    }
+
+    /// Plays `plan`.
+    pub fn play(plan: Plan<3>) -> Self {
+        Self::new(Work::Play { plan })
+    }
+
+    fn new(work: Work) -> Self {
+        Self {
+            work,
+            phase: Phase::Waiting(None),
+            started: None,
+            engaged_at: None,
+            requests: 0,
+            trouble: None,
+        }
+    }
+
+    /// When the recording's own time was 0 on the session clock, once known.
+    pub fn zero(&self) -> Option<Stamp> {
+        match &self.work {
+            Work::Replay { recording, .. } => self.started.map(|t| t.offset_by_secs(recording.rest_s)),
+            Work::Play { .. } => self.engaged_at,
+        }
+    }
+
+    /// How far the task has got, in [0, 1].
+    pub fn progress(&self) -> f64 {
+        match &self.work {
+            Work::Replay { recording, next } => *next as f64 / self.count(recording) as f64,
+            Work::Play { .. } => f64::from(u8::from(self.phase == Phase::Over)),
+        }
+    }
+
+    /// Whether nothing more can come of it, at `now`.
+    pub fn is_over(&self, now: Stamp) -> bool {
+        self.phase == Phase::Over
+            || match &self.work {
+                Work::Replay { recording, .. } => {
+                    let end_s = recording.samples.last().map_or(0.0, |s| s.0);
+                    self.zero().is_some_and(|zero| now.secs_since(zero) > end_s + LEAVE_S)
+                }
+                Work::Play { .. } => self.trouble.is_some(),
+            }
+    }
+
+    /// Whether the clutch has been let go after an engagement.
+    pub fn has_released(&self) -> bool {
+        matches!(self.phase, Phase::Leaving(_) | Phase::Over)
+    }
+
+    /// How it ended; `quit` says that it was cut short from outside.
+    pub fn outcome(&self, quit: bool) -> Outcome {
+        match &self.trouble {
+            Some(why) => Outcome::Interrupted(why.clone()),
+            None if quit => Outcome::Interrupted("stopped by hand".into()),
+            None if self.phase == Phase::Over => Outcome::Completed,
+            None => Outcome::Interrupted("the link was not back before the recording ended".into()),
+        }
+    }
+
+    /// The connection was lost: the arm holds, and nothing here engages it again.
+    pub fn on_lost(&mut self, why: &str) {
+        if matches!(self.phase, Phase::Asked | Phase::Engaged) {
+            self.give_up(format!("the link was lost ({why}); the arm holds and is not engaged again by itself"));
+        }
+    }
+
+    /// The session reports.
+    pub fn on_event(&mut self, now: Stamp, event: &Event) {
+        match event {
+            Event::Engaged { .. } => {
+                self.phase = Phase::Engaged;
+                self.engaged_at = Some(now);
+            }
+            Event::Refused(Refusal::ClockUnknown | Refusal::Moving | Refusal::StaleReference) => {
+                self.phase = Phase::Waiting(Some(now.offset_by_secs(RETRY_S)));
+            }
+            Event::Refused(Refusal::Diverged) => {}
+            Event::Refused(reason) => self.give_up(format!("the robot declines: {reason:?}")),
+            Event::State(RobotState::Holding, cause) => {
+                self.give_up(format!("the arm stopped by itself ({cause:?}) and holds; engage again on purpose"));
+            }
+            Event::State(RobotState::Stopped, _) => self.give_up("emergency stop".into()),
+            Event::State(RobotState::Ready, Cause::PlanFinished) => {
+                self.phase = Phase::Leaving(now.offset_by_secs(LEAVE_S));
+            }
+            Event::Ready | Event::State(..) | Event::Telemetry(_) => {}
+        }
+    }
+
+    /// Feeds the session what is due at `now`.
+    pub fn advise(&mut self, now: Stamp, session: &mut Session) -> Advice {
+        match self.phase {
+            Phase::Over => return Advice::Finished,
+            Phase::Leaving(at) if now >= at => {
+                self.phase = Phase::Over;
+                return Advice::Finished;
+            }
+            _ => {}
+        }
+        if session.info().is_none() || (self.started.is_none() && !session.is_ready()) {
+            return Advice::Continue;
+        }
+        let started = *self.started.get_or_insert(now);
+        let may_ask = self.trouble.is_none() && matches!(self.phase, Phase::Waiting(at) if at.is_none_or(|at| now >= at));
+        match &mut self.work {
+            Work::Play { plan } if may_ask => {
+                session.play(plan);
+                self.asked();
+            }
+            Work::Play { .. } => {}
+            Work::Replay { recording, next } => {
+                let mut fresh = false;
+                while let Some(sample) = sample_at(recording, *next, started).filter(|s| s.t <= now) {
+                    session.handle_sample(now, sample);
+                    fresh = true;
+                    *next += 1;
+                }
+                let done = sample_at(recording, *next, started).is_none();
+                if fresh && may_ask && !done {
+                    session.engage(now);
+                    self.asked();
+                }
+                if done && !self.has_released() {
+                    session.release();
+                    self.phase = Phase::Leaving(now.offset_by_secs(LEAVE_S));
+                    if self.engaged_at.is_none() && self.trouble.is_none() {
+                        self.trouble = Some("the robot never engaged".into());
+                    }
+                }
+            }
+        }
+        Advice::Continue
+    }
+
+    /// When [`Task::advise`] has something to do next.
+    pub fn poll_timeout(&self) -> Option<Stamp> {
+        let retry = if let Phase::Waiting(at) = self.phase { at } else { None };
+        let leave = if let Phase::Leaving(at) = self.phase { Some(at) } else { None };
+        let sample = match (&self.work, self.started) {
+            (Work::Replay { recording, next }, Some(started)) => {
+                sample_at(recording, *next, started).map(|s| s.t)
+            }
+            _ => None,
+        };
+        [retry.filter(|_| self.started.is_some()), leave, sample].into_iter().flatten().min()
+    }
+
+    fn asked(&mut self) {
+        self.requests += 1;
+        self.phase = Phase::Asked;
+        if self.requests > MAX_REQUESTS {
+            self.give_up("the robot does not engage".into());
+        }
+    }
+
+    fn give_up(&mut self, why: String) {
+        self.trouble.get_or_insert(why);
+        if matches!(self.work, Work::Play { .. }) || self.requests > MAX_REQUESTS {
+            self.phase = Phase::Over;
+        } else if !self.has_released() {
+            self.phase = Phase::Waiting(None);
+        }
+    }
+
+    fn count(&self, recording: &Recording) -> usize {
+        recording.samples.len() + rest_samples(recording)
+    }
+}
+
+/// Interval of the samples at rest, s.
+const REST_INTERVAL_S: f64 = 1.0 / 30.0;
+
+fn rest_samples(recording: &Recording) -> usize {
+    (recording.rest_s / REST_INTERVAL_S) as usize
+}
+
+/// Sample `i`, those at rest first.
+fn sample_at(recording: &Recording, i: usize, started: Stamp) -> Option<HandSample> {
+    let resting = rest_samples(recording);
+    let first = recording.samples.first()?;
+    if i < resting {
+        return Some(HandSample { t: started.offset_by_secs(i as f64 * REST_INTERVAL_S), x: first.1 });
+    }
+    let (t_s, x) = recording.samples.get(i - resting)?;
+    Some(HandSample { t: started.offset_by_secs(recording.rest_s + t_s - first.0), x: *x })
+}

@@ -1,0 +1,161 @@
+//! The control stream: a greeting each way, then frames.
+
+use std::time::Duration;
+
+use quinn::{Connection, RecvStream, SendStream};
+use telemime_protocol::wire::DecodeError;
+use telemime_protocol::wire::frame::{self, Deframer, Frame};
+use telemime_protocol::wire::hello::{self, Answer, Hello, HelloError};
+use tokio::sync::mpsc;
+use tokio::time::timeout;
+
+/// A peer that connects but does not greet within this time is let go.
+pub const GREETING_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Frames read ahead of the session; a slow session pushes back on the stream, not on memory.
+const READ_AHEAD: usize = 4;
+
+/// Why the control stream ended.
+#[derive(Debug, thiserror::Error)]
+pub enum ControlError {
+    /// The connection ended.
+    #[error("{}", crate::quic::explain(.0))]
+    Connection(#[from] quinn::ConnectionError),
+    /// The stream was reset or closed under us.
+    #[error("control stream: {0}")]
+    Stream(String),
+    /// The peer said nothing in time.
+    #[error("the peer did not greet within {} s", GREETING_TIMEOUT.as_secs())]
+    Silent,
+    /// The greeting was none.
+    #[error("greeting: {0}")]
+    Hello(#[from] HelloError),
+    /// A frame was malformed.
+    #[error("control message: {0}")]
+    Frame(#[from] DecodeError),
+}
+
+/// Both directions of an open control stream, greetings still to come.
+#[derive(Debug)]
+pub struct Control {
+    /// Towards the peer.
+    pub send: SendStream,
+    recv: RecvStream,
+    read: Vec<u8>,
+}
+
+impl Control {
+    /// Opens the stream (operator).
+    ///
+    /// # Errors
+    /// [`ControlError::Connection`].
+    pub async fn open(connection: &Connection) -> Result<Self, ControlError> {
+        let (send, recv) = connection.open_bi().await?;
+        Ok(Self { send, recv, read: Vec::new() })
+    }
+
+    /// Waits for the stream (robot).
+    ///
+    /// # Errors
+    /// [`ControlError`], also if the peer opens none in time.
+    pub async fn accept(connection: &Connection) -> Result<Self, ControlError> {
+        let (send, recv) =
+            timeout(GREETING_TIMEOUT, connection.accept_bi()).await.map_err(|_| ControlError::Silent)??;
+        Ok(Self { send, recv, read: Vec::new() })
+    }
+
+    /// Reads the operator's greeting.
+    ///
+    /// # Errors
+    /// [`ControlError`].
+    pub async fn hello(&mut self) -> Result<Hello, ControlError> {
+        self.greeting(Hello::decode).await
+    }
+
+    /// Reads the robot's answer.
+    ///
+    /// # Errors
+    /// [`ControlError`].
+    pub async fn answer(&mut self) -> Result<Answer, ControlError> {
+        self.greeting(Answer::decode).await
+    }
+
+    /// Writes raw bytes: a greeting.
+    ///
+    /// # Errors
+    /// [`ControlError::Stream`].
+    pub async fn write(&mut self, bytes: &[u8]) -> Result<(), ControlError> {
+        self.send.write_all(bytes).await.map_err(|e| ControlError::Stream(e.to_string()))
+    }
+
+    /// Greetings are over: frames arrive on the receiver, after whose last item the stream has ended.
+    pub fn into_frames(self) -> (SendStream, mpsc::Receiver<Result<Frame, ControlError>>) {
+        let (tx, rx) = mpsc::channel(READ_AHEAD);
+        tokio::spawn(read_frames(self.recv, self.read, tx));
+        (self.send, rx)
+    }
+
+    async fn greeting<T>(
+        &mut self,
+        decode: impl Fn(&[u8]) -> Result<Option<(T, usize)>, HelloError>,
+    ) -> Result<T, ControlError> {
+        let read = async {
+            loop {
+                if let Some((greeting, used)) = decode(&self.read)? {
+                    self.read.drain(..used);
+                    return Ok(greeting);
+                }
+                let mut buffer = [0; hello::MAX_LEN];
+                match self.recv.read(&mut buffer).await {
+                    Ok(Some(n)) => self.read.extend_from_slice(&buffer[..n]),
+                    Ok(None) => return Err(ControlError::Stream("ended before the greeting".into())),
+                    Err(quinn::ReadError::ConnectionLost(e)) => return Err(e.into()),
+                    Err(e) => return Err(ControlError::Stream(e.to_string())),
+                }
+            }
+        };
+        timeout(GREETING_TIMEOUT, read).await.map_err(|_| ControlError::Silent)?
+    }
+}
+
+/// Writes one message as a frame.
+///
+/// # Errors
+/// [`ControlError::Stream`] if the stream has ended.
+pub async fn write_frame(send: &mut SendStream, payload: &[u8]) -> Result<(), ControlError> {
+    send.write_all(&frame::encode(payload, false)).await.map_err(|e| ControlError::Stream(e.to_string()))
+}
+
+async fn read_frames(mut recv: RecvStream, read: Vec<u8>, tx: mpsc::Sender<Result<Frame, ControlError>>) {
+    let mut deframer = Deframer::default();
+    deframer.push(&read);
+    let mut buffer = vec![0; 16 * 1024];
+    loop {
+        loop {
+            match deframer.next_frame() {
+                Ok(Some(frame)) => {
+                    if tx.send(Ok(frame)).await.is_err() {
+                        return;
+                    }
+                }
+                Ok(None) => break,
+                Err(e) => {
+                    let _ = tx.send(Err(e.into())).await;
+                    return;
+                }
+            }
+        }
+        let end = match recv.read(&mut buffer).await {
+            Ok(Some(n)) => {
+                deframer.push(&buffer[..n]);
+                continue;
+            }
+            Ok(None) => ControlError::Stream("ended by the peer".into()),
+            Err(quinn::ReadError::ConnectionLost(e)) => e.into(),
+            Err(e) => ControlError::Stream(e.to_string()),
+        };
+        // Nobody listening means the session is over already.
+        let _ = tx.send(Err(end)).await;
+        return;
+    }
+}

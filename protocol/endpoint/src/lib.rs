@@ -1,0 +1,13 @@
+//! What the two daemons' shells share and the protocol must not know: the host's clock, an identity,
+//! TLS that trusts pinned keys only, and QUIC set up for teleoperation.
+
+pub mod clock;
+pub mod control;
+pub mod identity;
+pub mod meter;
+pub mod quic;
+pub mod tls;
+
+pub use clock::{HostClock, Mono};
+pub use identity::{Fingerprint, Identity, IdentityError};
+pub use meter::Meter;

@@ -1,0 +1,528 @@
+//! Version 1: every message, never edited once released (a change is a new version).
+//!
+//! Control messages ride in frames on the control stream; what must be fresh rides in datagrams.
+//! Times in datagrams are µs on the session clock unless the field says otherwise.
+
+use serde::{Deserialize, Serialize};
+
+use super::codec::{self, DecodeError};
+use super::frame::MAX_FRAME_LEN;
+use super::state::WireState;
+use crate::predict::Params;
+
+/// The version this module speaks.
+pub const VERSION: u16 = 1;
+
+/// The ALPN identifier that goes with it; it freezes the framing.
+pub const ALPN: &[u8] = b"telemime/1";
+
+/// Longest datagram either end accepts, bytes.
+pub const MAX_DATAGRAM_LEN: usize = 1100;
+
+/// Most path knots in one [`Motion`].
+pub const MAX_KNOTS: usize = 32;
+
+/// Most joints in a [`Telemetry`].
+pub const MAX_JOINTS: usize = 10;
+
+/// Longest skill model, bytes.
+pub const MAX_MODEL_LEN: usize = 512 * 1024;
+
+/// Longest motion plan, bytes.
+pub const MAX_PLAN_LEN: usize = 128 * 1024;
+
+/// A skill model's identity: the head of its SHA-256.
+pub type ModelId = [u8; 16];
+
+/// The part of a [`ModelId`] that every motion carries.
+pub fn model_tag(id: &ModelId) -> u16 {
+    u16::from_le_bytes([id[0], id[1]])
+}
+
+/// Operator → robot, on the control stream.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum OperatorControl {
+    /// The skill model, once a session unless the robot already holds it.
+    Model {
+        /// Hash of `bytes`, to be verified.
+        id: ModelId,
+        /// `Skill::to_bytes`.
+        bytes: Vec<u8>,
+    },
+    /// A motion to be played.
+    Plan {
+        /// Names the plan in `Engage`.
+        id: u32,
+        /// `checkpoint::Plan` in its encoding.
+        bytes: Vec<u8>,
+    },
+    /// Asks for motion. The robot takes its reference at the instant it engages.
+    Engage(Engage),
+    /// The clutch is let go: stop and hold.
+    Release {
+        /// Which engagement ends.
+        engagement: u32,
+    },
+    /// Emergency stop, latched until [`OperatorControl::Reset`].
+    EmergencyStop,
+    /// Leaves the latched stop, on purpose.
+    Reset,
+    /// The operator ends the session.
+    Goodbye,
+}
+
+/// How to engage.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Engage {
+    /// Counts up within the session; motions of another engagement are dropped.
+    pub engagement: u32,
+    /// What drives.
+    pub drive: Drive,
+    /// Tip metres per hand metre, in (0, 10].
+    pub scale: f32,
+    /// Unit quaternion w, x, y, z that turns hand axes into the robot's base axes.
+    pub rotation: [f32; 4],
+    /// Bound of the path knots, µm: their quantisation steps follow from it.
+    pub path_bound_um: u32,
+    /// First lease, ms.
+    pub lease_ms: u16,
+}
+
+/// What drives the arm.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum Drive {
+    /// The operator's hand, live.
+    Mirror {
+        /// The newest hand state; the reference is its prediction for the instant of engaging.
+        state: WireState,
+        /// As in [`Motion::model`].
+        model: u16,
+        /// As in [`Motion::params`].
+        params: WireParams,
+    },
+    /// A plan sent before.
+    Play {
+        /// Its id.
+        plan: u32,
+    },
+}
+
+/// Robot → operator, on the control stream.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum RobotControl {
+    /// The first message of a session.
+    Info(Info),
+    /// The model is stored and will be used.
+    ModelStored {
+        /// Its hash.
+        id: ModelId,
+    },
+    /// The plan is stored.
+    PlanStored {
+        /// Its id.
+        id: u32,
+    },
+    /// The arm follows from now on.
+    Engaged {
+        /// Which request is granted.
+        engagement: u32,
+        /// When, µs on the session clock as the robot estimates it.
+        t_us: i64,
+        /// The hand position that corresponds to the tip's position at that instant, m.
+        hand_m: [f32; 3],
+        /// The tip's position then, m in base axes.
+        tip_m: [f32; 3],
+    },
+    /// A request is declined.
+    Refused {
+        /// Why.
+        reason: Refusal,
+    },
+    /// The state has changed.
+    State {
+        /// The new state.
+        state: RobotState,
+        /// Why.
+        cause: Cause,
+    },
+}
+
+/// What the operator needs to know of the arm.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Info {
+    /// The robot's name, at most 64 bytes.
+    pub name: String,
+    /// Movable joints.
+    pub joints: u8,
+    /// Largest tip speed, m/s.
+    pub speed_m_s: f32,
+    /// Largest tip acceleration, m/s².
+    pub accel_m_s2: f32,
+    /// The tip may go this far from where it engages, m.
+    pub radius_m: f32,
+    /// From predicted target to tip, s: what the horizon adds to the age of the information.
+    pub lag_s: f32,
+    /// The model the robot still holds.
+    pub model: Option<ModelId>,
+    /// The state at the start of the session.
+    pub state: RobotState,
+}
+
+/// The robot's state (DESIGN §5).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum RobotState {
+    /// No operator.
+    Idle,
+    /// An operator has authority; the arm holds.
+    Ready,
+    /// Following.
+    Engaged,
+    /// Following the prediction alone, fading.
+    Coasting,
+    /// Stopped by itself; a fresh engage is needed.
+    Holding,
+    /// Emergency stop, latched.
+    Stopped,
+}
+
+/// Why the state changed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Cause {
+    /// The operator asked.
+    Requested,
+    /// News arrived again within the lease.
+    NewsArrived,
+    /// No news for a while; the lease still runs.
+    NewsLate,
+    /// The motion lease ran out.
+    LeaseExpired,
+    /// The plan has been played to its end.
+    PlanFinished,
+    /// The connection ended.
+    ConnectionLost,
+    /// Emergency stop by the operator.
+    OperatorStop,
+    /// Emergency stop at the robot.
+    LocalStop,
+    /// The robot's estimate of the session clock stepped.
+    ClockStep,
+}
+
+/// Why a request is declined.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Refusal {
+    /// The emergency stop is latched: reset first.
+    Stopped,
+    /// Already engaged.
+    AlreadyEngaged,
+    /// The engagement number is not above the last one.
+    OldEngagement,
+    /// The hand state is too old to take a reference from.
+    StaleReference,
+    /// The session clock is not known yet.
+    ClockUnknown,
+    /// The model's bytes do not match its hash, or are not a model.
+    BadModel,
+    /// The plan does not decode, or is not known.
+    BadPlan,
+    /// Scale, rotation or bound outside what the message allows.
+    BadMapping,
+    /// The arm still moves.
+    Moving,
+    /// The two ends compute different predictions; the robot goes on with constant velocity.
+    Diverged,
+}
+
+/// Operator → robot, datagrams.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum OperatorDatagram {
+    /// Mirror: the future and the path.
+    Motion(Motion),
+    /// Play: go on.
+    Go {
+        /// The session's epoch.
+        epoch: u32,
+        /// The engagement that goes on.
+        engagement: u32,
+        /// Counts up with every motion or go of the session.
+        seq: u32,
+        /// When it was sent, µs.
+        t_us: i64,
+        /// For how long motion is authorised, ms.
+        lease_ms: u16,
+    },
+    /// Answer to [`RobotDatagram::Ping`].
+    Pong {
+        /// The session's epoch.
+        epoch: u32,
+        /// `t1_us` of the ping.
+        t1_us: i64,
+        /// When the ping arrived, µs on the session clock.
+        t2_us: i64,
+        /// When this left.
+        t3_us: i64,
+    },
+    /// Emergency stop, repeated until the robot reports [`RobotState::Stopped`].
+    Stop {
+        /// The session's epoch.
+        epoch: u32,
+    },
+}
+
+/// The newest state of the hand, and the knots of its path that are not yet acknowledged.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Motion {
+    /// The session's epoch.
+    pub epoch: u32,
+    /// The engagement this belongs to.
+    pub engagement: u32,
+    /// Counts up with every motion or go of the session.
+    pub seq: u32,
+    /// For how long motion is authorised from arrival, ms.
+    pub lease_ms: u16,
+    /// [`model_tag`] of the model to predict with; 0 is constant velocity.
+    pub model: u16,
+    /// Parameters to predict with.
+    pub params: WireParams,
+    /// Checksum of the operator's own prediction from `state`, in keyframes.
+    pub checksum: Option<u32>,
+    /// The newest hand state.
+    pub state: WireState,
+    /// Number of the first of `knots` in the engagement's path.
+    pub first_knot: u32,
+    /// Unacknowledged knots of the path in order, the oldest first.
+    pub knots: Vec<WireKnot>,
+}
+
+/// `predict::Params` in steps of 1/255.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WireParams {
+    /// Prediction gain κ.
+    pub gain: u8,
+    /// Weight of the mixture against constant velocity.
+    pub trust: u8,
+    /// Factor on the constant velocity.
+    pub cv_damping: u8,
+}
+
+impl WireParams {
+    /// The nearest parameters that can travel.
+    pub fn quantise(params: &Params) -> Self {
+        let step = |v: f64| (v * 255.0).round() as u8;
+        Self { gain: step(params.gain), trust: step(params.trust), cv_damping: step(params.cv_damping) }
+    }
+
+    /// The parameters both ends use.
+    pub fn dequantise(self) -> Params {
+        let value = |v: u8| f64::from(v) / 255.0;
+        Params { gain: value(self.gain), trust: value(self.trust), cv_damping: value(self.cv_damping) }
+    }
+}
+
+/// A knot of the path, relative to the one before it in the message; [`super::knots`] converts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WireKnot {
+    /// Distance in time: twice the ticks, plus 1 if the path starts afresh here. The first knot counts
+    /// backwards from the message's state, the others forwards from the knot before.
+    pub dt: u32,
+    /// Position minus that of the knot before (the first: minus the message's state), in steps.
+    pub dx: [i32; 3],
+    /// Tangent, in steps.
+    pub v: [i32; 3],
+}
+
+/// Robot → operator, datagrams.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum RobotDatagram {
+    /// Asks for the session clock.
+    Ping {
+        /// The session's epoch.
+        epoch: u32,
+        /// When this left, µs on the robot's own clock.
+        t1_us: i64,
+    },
+    /// How the robot is.
+    Telemetry(Telemetry),
+}
+
+/// How the robot is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Telemetry {
+    /// The session's epoch.
+    pub epoch: u32,
+    /// Counts up.
+    pub seq: u32,
+    /// The state.
+    pub state: RobotState,
+    /// The engagement followed last.
+    pub engagement: u32,
+    /// When this holds, µs on the session clock as the robot estimates it; 0 while unknown.
+    pub t_us: i64,
+    /// Bound of that estimate's error, µs.
+    pub clock_uncertainty_us: u32,
+    /// Age of the newest hand state, ms.
+    pub age_ms: u16,
+    /// One-way delay of the newest motion, on the estimated clock, ms.
+    pub delay_ms: u16,
+    /// Path knots held without a gap: everything before this number is acknowledged.
+    pub path_frontier: u32,
+    /// Motions received, of those sent up to the newest.
+    pub received: u32,
+    /// Number of the newest motion.
+    pub newest_seq: u32,
+    /// Motions dropped: late, foreign, malformed.
+    pub dropped: u32,
+    /// Ticks on which a limit was active in this engagement.
+    pub clamps: u32,
+    /// Mean work of a servo tick, ns.
+    pub tick_mean_ns: u32,
+    /// 99th percentile of it, ns.
+    pub tick_p99_ns: u32,
+    /// Ticks that began late by more than a period.
+    pub overruns: u32,
+    /// Tip, m in base axes.
+    pub tip_m: [f32; 3],
+    /// Joint positions, rad or m.
+    pub q: Vec<f32>,
+}
+
+/// A message of this version that can be decoded from untrusted bytes.
+pub trait Message: Sized {
+    /// The canonical bytes.
+    fn encode(&self) -> Vec<u8>;
+
+    /// From exactly these bytes.
+    ///
+    /// # Errors
+    /// [`DecodeError`]: malformed, not canonical, or a field outside its range.
+    fn decode(bytes: &[u8]) -> Result<Self, DecodeError>;
+}
+
+macro_rules! message {
+    ($type:ty, $limit:expr) => {
+        impl Message for $type {
+            fn encode(&self) -> Vec<u8> {
+                codec::encode(self)
+            }
+
+            fn decode(bytes: &[u8]) -> Result<Self, DecodeError> {
+                let message = codec::decode::<Self, { $limit }>(bytes)?;
+                message.check()?;
+                Ok(message)
+            }
+        }
+    };
+}
+
+message!(OperatorControl, MAX_FRAME_LEN);
+message!(RobotControl, MAX_FRAME_LEN);
+message!(OperatorDatagram, MAX_DATAGRAM_LEN);
+message!(RobotDatagram, MAX_DATAGRAM_LEN);
+
+fn require(ok: bool, field: &'static str, why: &'static str) -> Result<(), DecodeError> {
+    if ok {
+        Ok(())
+    } else {
+        Err(DecodeError::Invalid { field, why })
+    }
+}
+
+fn finite(values: &[f32]) -> bool {
+    values.iter().all(|v| v.is_finite())
+}
+
+impl OperatorControl {
+    fn check(&self) -> Result<(), DecodeError> {
+        match self {
+            Self::Model { bytes, .. } => {
+                require(bytes.len() <= MAX_MODEL_LEN, "model.bytes", "too long")
+            }
+            Self::Plan { bytes, .. } => {
+                require(bytes.len() <= MAX_PLAN_LEN, "plan.bytes", "too long")
+            }
+            Self::Engage(engage) => {
+                require(
+                    engage.scale > 0.0 && engage.scale <= 10.0,
+                    "engage.scale",
+                    "outside (0, 10]",
+                )?;
+                let norm: f32 = engage.rotation.iter().map(|v| v * v).sum();
+                require(
+                    (norm - 1.0).abs() < 1e-3,
+                    "engage.rotation",
+                    "not a unit quaternion",
+                )?;
+                require(engage.path_bound_um > 0, "engage.path_bound_um", "zero")?;
+                match &engage.drive {
+                    Drive::Mirror { state, .. } => state.check(),
+                    Drive::Play { .. } => Ok(()),
+                }
+            }
+            Self::Release { .. } | Self::EmergencyStop | Self::Reset | Self::Goodbye => Ok(()),
+        }
+    }
+}
+
+impl RobotControl {
+    fn check(&self) -> Result<(), DecodeError> {
+        match self {
+            Self::Info(info) => {
+                require(info.name.len() <= 64, "info.name", "longer than 64 bytes")?;
+                let limits = [info.speed_m_s, info.accel_m_s2, info.radius_m];
+                require(
+                    limits.iter().all(|v| v.is_finite() && *v > 0.0),
+                    "info",
+                    "limits must be positive",
+                )?;
+                require(
+                    (0.0..=2.0).contains(&info.lag_s),
+                    "info.lag_s",
+                    "outside 0 to 2 s",
+                )
+            }
+            Self::Engaged { hand_m, tip_m, .. } => {
+                require(finite(hand_m) && finite(tip_m), "engaged", "not finite")
+            }
+            Self::ModelStored { .. }
+            | Self::PlanStored { .. }
+            | Self::Refused { .. }
+            | Self::State { .. } => Ok(()),
+        }
+    }
+}
+
+impl OperatorDatagram {
+    fn check(&self) -> Result<(), DecodeError> {
+        match self {
+            Self::Motion(motion) => {
+                require(
+                    motion.knots.len() <= MAX_KNOTS,
+                    "motion.knots",
+                    "more than 32",
+                )?;
+                motion.state.check()
+            }
+            Self::Go { .. } | Self::Pong { .. } | Self::Stop { .. } => Ok(()),
+        }
+    }
+}
+
+impl RobotDatagram {
+    fn check(&self) -> Result<(), DecodeError> {
+        match self {
+            Self::Ping { .. } => Ok(()),
+            Self::Telemetry(telemetry) => {
+                require(
+                    telemetry.q.len() <= MAX_JOINTS,
+                    "telemetry.q",
+                    "more than 10 joints",
+                )?;
+                require(
+                    finite(&telemetry.q) && finite(&telemetry.tip_m),
+                    "telemetry",
+                    "not finite",
+                )
+            }
+        }
+    }
+}

@@ -1,0 +1,182 @@
+//! The robot's estimate of the session clock, from four-timestamp exchanges (RFC 5905 §8).
+
+use std::collections::VecDeque;
+
+use telemime_endpoint::Mono;
+use telemime_protocol::time::Stamp;
+
+/// Exchanges remembered; at four a second, half a minute.
+const WINDOW: usize = 128;
+
+/// Exchanges before the estimate counts.
+const ENOUGH: usize = 4;
+
+/// How far two crystals may drift apart, s per s.
+const DRIFT: f64 = 50e-6;
+
+/// How fast the applied offset follows the estimate, s per s.
+const SLEW: f64 = 5e-3;
+
+/// A larger difference between estimate and applied offset than this is a step, not drift, s.
+const STEP_S: f64 = 0.05;
+
+#[derive(Debug, Clone, Copy)]
+struct Exchange {
+    at: Mono,
+    rtt_s: f64,
+    offset_ns: i64,
+}
+
+/// What applying the estimate did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Slew {
+    /// The applied offset follows within its rate.
+    Smooth,
+    /// The estimate lies so far off that following it smoothly would take seconds: a stop and a fresh reference.
+    Step,
+}
+
+/// Offset of the session clock to the robot's own, with the bound of its error.
+///
+/// The exchange with the shortest round trip tells the offset best; an older one loses by what the
+/// crystals may have drifted since. An asymmetry of the path cannot be seen from inside: the error is
+/// bounded by half the round trip and no better.
+#[derive(Debug, Default)]
+pub struct SessionClock {
+    exchanges: VecDeque<Exchange>,
+    applied: Option<(Mono, f64)>,
+}
+
+impl SessionClock {
+    /// Takes an exchange: ping sent `t1` (robot), received `t2` and answered `t3` (session), received `t4` (robot).
+    ///
+    /// Nonsense (a negative round trip) is ignored.
+    pub fn observe(&mut self, t1: Mono, t2: Stamp, t3: Stamp, t4: Mono) {
+        let rtt_ns = (t4.0.saturating_sub(t1.0)).saturating_sub(t3.0.saturating_sub(t2.0));
+        if rtt_ns < 0 || t3 < t2 {
+            return;
+        }
+        let offset_ns = (t2.0.saturating_sub(t1.0) / 2).saturating_add(t3.0.saturating_sub(t4.0) / 2);
+        if self.exchanges.len() == WINDOW {
+            self.exchanges.pop_front();
+        }
+        self.exchanges.push_back(Exchange { at: t4, rtt_s: rtt_ns as f64 * 1e-9, offset_ns });
+    }
+
+    /// Moves the applied offset towards the estimate; at once while `following` is false.
+    pub fn slew(&mut self, now: Mono, following: bool) -> Slew {
+        let Some(best) = self.best(now) else { return Slew::Smooth };
+        let target_ns = best.offset_ns as f64;
+        match self.applied {
+            Some((since, applied_ns)) if following => {
+                let error_ns = target_ns - applied_ns;
+                let most_ns = SLEW * now.secs_since(since).max(0.0) * 1e9;
+                self.applied = Some((now, applied_ns + error_ns.clamp(-most_ns, most_ns)));
+                if error_ns.abs() > STEP_S * 1e9 { Slew::Step } else { Slew::Smooth }
+            }
+            _ => {
+                self.applied = Some((now, target_ns));
+                Slew::Smooth
+            }
+        }
+    }
+
+    /// Whether enough is known to convert stamps.
+    pub fn is_known(&self) -> bool {
+        self.applied.is_some()
+    }
+
+    /// When `stamp` was, or will be, on the robot's clock.
+    pub fn to_mono(&self, stamp: Stamp) -> Option<Mono> {
+        self.applied.map(|(_, offset_ns)| Mono(stamp.0.saturating_sub(offset_ns.round() as i64)))
+    }
+
+    /// What the session clock shows at `mono`.
+    pub fn to_session(&self, mono: Mono) -> Option<Stamp> {
+        self.applied.map(|(_, offset_ns)| Stamp(mono.0.saturating_add(offset_ns.round() as i64)))
+    }
+
+    /// Bound of the offset's error, s: half the best round trip, and the drift since.
+    pub fn uncertainty_s(&self, now: Mono) -> Option<f64> {
+        self.best(now).map(|e| badness_s(e, now))
+    }
+
+    /// The shortest round trip seen lately, s.
+    pub fn rtt_s(&self) -> Option<f64> {
+        self.exchanges.iter().map(|e| e.rtt_s).reduce(f64::min)
+    }
+
+    fn best(&self, now: Mono) -> Option<&Exchange> {
+        if self.exchanges.len() < ENOUGH {
+            return None;
+        }
+        self.exchanges.iter().min_by(|a, b| badness_s(a, now).total_cmp(&badness_s(b, now)))
+    }
+}
+
+fn badness_s(exchange: &Exchange, now: Mono) -> f64 {
+    exchange.rtt_s / 2.0 + DRIFT * now.secs_since(exchange.at).max(0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_xoshiro::Xoshiro256PlusPlus;
+
+    const MS: i64 = 1_000_000;
+
+    fn exchange(clock: &mut SessionClock, at: i64, offset: i64, up: i64, down: i64) {
+        let (t1, t2) = (at, at + up + offset);
+        clock.observe(Mono(t1), Stamp(t2), Stamp(t2 + MS), Mono(at + up + MS + down));
+    }
+
+    #[test]
+    fn jitter_is_filtered_by_the_shortest_round_trip_and_the_error_stays_within_the_bound() {
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(5);
+        let offset = -7_000 * MS;
+        let mut clock = SessionClock::default();
+        for i in 0..40 {
+            let mut delay = || rng.random_range(90 * MS..110 * MS);
+            exchange(&mut clock, i * 250 * MS, offset, delay(), delay());
+        }
+        let now = Mono(40 * 250 * MS);
+        assert_eq!(clock.slew(now, false), Slew::Smooth);
+        let error_s = clock.to_session(now).unwrap().0 - (now.0 + offset);
+        assert!(error_s.abs() < 6 * MS, "{error_s} ns");
+        let bound_s = clock.uncertainty_s(now).unwrap();
+        assert!((error_s as f64 * 1e-9).abs() < bound_s && bound_s < 0.101, "{bound_s}");
+    }
+
+    #[test]
+    fn an_asymmetry_is_invisible_and_within_the_bound() {
+        let mut clock = SessionClock::default();
+        for i in 0..8 {
+            exchange(&mut clock, i * 250 * MS, 0, 140 * MS, 60 * MS);
+        }
+        let now = Mono(8 * 250 * MS);
+        clock.slew(now, false);
+        let error_s = (clock.to_session(now).unwrap().0 - now.0) as f64 * 1e-9;
+        assert!((error_s - 0.04).abs() < 1e-6, "half the asymmetry: {error_s}");
+        assert!(error_s < clock.uncertainty_s(now).unwrap());
+    }
+
+    #[test]
+    fn the_applied_offset_follows_slowly_and_reports_a_step() {
+        let mut clock = SessionClock::default();
+        for i in 0..4 {
+            exchange(&mut clock, i * 10 * MS, 0, 2 * MS, 2 * MS);
+        }
+        assert!(!clock.is_known());
+        clock.slew(Mono(50 * MS), true);
+        assert!(clock.is_known());
+        exchange(&mut clock, 60 * MS, 10 * MS, MS, MS);
+        assert_eq!(clock.slew(Mono(1050 * MS), true), Slew::Smooth);
+        let moved = clock.to_session(Mono(0)).unwrap().0;
+        assert_eq!(moved, 5 * MS, "5 ms in a second, no more");
+        exchange(&mut clock, 70 * MS, 500 * MS, 0, 0);
+        assert_eq!(clock.slew(Mono(1051 * MS), true), Slew::Step);
+        clock.observe(Mono(100), Stamp(0), Stamp(500), Mono(200));
+        assert_eq!(clock.exchanges.len(), 6, "a negative round trip is no exchange");
+    }
+}

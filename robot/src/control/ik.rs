@@ -1,0 +1,299 @@
+//! Differential inverse kinematics: from the tip's reference to the joints'.
+
+use std::sync::Arc;
+
+use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector3};
+use telemime_sim::arm::{ArmModel, Jacobian, Joints, Kinematics, MAX_JOINTS};
+
+type Rows = SMatrix<f64, 3, MAX_JOINTS>;
+
+/// Gains of the inverse kinematics.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct IkConfig {
+    /// How fast a position error of the joint reference is closed, 1/s.
+    pub position_gain: f64,
+    /// How fast an orientation error is closed where the arm has joints to spare for it, 1/s.
+    pub orientation_gain: f64,
+    /// How fast the remaining freedom returns to the rest posture, 1/s.
+    pub posture_gain: f64,
+    /// Tick, s.
+    pub dt_s: f64,
+}
+
+/// Joint positions, velocities and accelerations that the torque control follows.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct JointReference {
+    /// Position, rad or m.
+    pub q: Joints,
+    /// Velocity, rad/s or m/s.
+    pub qd: Joints,
+    /// Acceleration until the next tick, rad/s² or m/s².
+    pub qdd: Joints,
+}
+
+/// What a step ran into; bit `i` stands for joint `i`.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct JointStep {
+    /// The step was slowed along its path to keep joint speeds or accelerations within limits.
+    pub slowed: bool,
+    /// The tip is near a singular posture: motion is damped.
+    pub singular: bool,
+    /// Joints held back by their end of range.
+    pub at_limit: u16,
+    /// Where the reference is to be, less where it is, m.
+    pub error_m: Vector3<f64>,
+}
+
+/// Velocity resolution by task priority: position first, orientation in its null space, posture in both.
+pub(super) struct Resolved {
+    pub(super) primary: Joints,
+    pub(super) secondary: Joints,
+    /// Smallest singular value of the position Jacobian, m/rad.
+    pub(super) sigma_min: f64,
+}
+
+/// Damped least squares: q̇ = Jᵀ(JJᵀ + λ²1)⁻¹v with λ² = (ε/2)²(1 − (σ/ε)²) where the smallest singular value σ is below ε
+/// (Nakamura & Hanafusa 1986 with the damping of Chiaverini 1997), the second task in the first one's null space
+/// (Nakamura 1987, eq. 4.12).
+pub(super) fn resolve(
+    jacobian: &Jacobian,
+    tip_velocity: &Vector3<f64>,
+    angular_velocity: &Vector3<f64>,
+    posture_velocity: &Joints,
+    epsilon: f64,
+) -> Resolved {
+    let linear: Rows = jacobian.fixed_rows::<3>(0).into();
+    let angular: Rows = jacobian.fixed_rows::<3>(3).into();
+    let gram = linear * linear.transpose();
+    let sigma_min = min_eigenvalue(&gram).max(0.0).sqrt();
+    let damping = if sigma_min < epsilon {
+        0.25 * (epsilon * epsilon - sigma_min * sigma_min)
+    } else {
+        0.0
+    };
+    let inverse = damped_inverse(&gram, damping);
+    let primary = linear.transpose() * (inverse * tip_velocity);
+    let freed = angular - (angular * linear.transpose()) * inverse * linear;
+    // 0.2 rad/rad: an arm of five axes never has a free rotation about every axis, and what it lacks must not be bought dearly.
+    let inverse_freed = damped_inverse(&(freed * freed.transpose()), 0.2 * 0.2);
+    let left_over = angular_velocity - angular * primary;
+    let idle = posture_velocity - linear.transpose() * (inverse * (linear * posture_velocity));
+    let secondary = idle + freed.transpose() * (inverse_freed * (left_over - freed * idle));
+    Resolved {
+        primary,
+        secondary,
+        sigma_min,
+    }
+}
+
+fn damped_inverse(gram: &Matrix3<f64>, damping: f64) -> Matrix3<f64> {
+    (gram + Matrix3::from_diagonal_element(damping))
+        .try_inverse()
+        .unwrap_or_else(Matrix3::zeros)
+}
+
+/// Smallest eigenvalue of a symmetric matrix (Smith 1961).
+pub(super) fn min_eigenvalue(m: &Matrix3<f64>) -> f64 {
+    let mean = m.trace() / 3.0;
+    let off = m - Matrix3::from_diagonal_element(mean);
+    let spread = (off.norm_squared() / 6.0).sqrt();
+    if spread <= f64::EPSILON * mean.abs() {
+        return mean;
+    }
+    let r = ((off / spread).determinant() / 2.0).clamp(-1.0, 1.0);
+    mean + 2.0 * spread * (r.acos() / 3.0 + 2.0 * core::f64::consts::FRAC_PI_3).cos()
+}
+
+/// The rotation that takes `from` to `to`, as an axis times an angle in the base frame, rad.
+pub(super) fn orientation_error(from: &Matrix3<f64>, to: &Matrix3<f64>) -> Vector3<f64> {
+    UnitQuaternion::from_matrix_eps(
+        &(to * from.transpose()),
+        1e-12,
+        50,
+        UnitQuaternion::identity(),
+    )
+    .scaled_axis()
+}
+
+/// The smallest singular value below which a posture counts as near-singular, for an arm of this length.
+pub(super) fn singular_below(arm: &ArmModel) -> f64 {
+    0.08 * arm.chain_length_m()
+}
+
+/// The joints' reference, led by the tip's.
+#[derive(Clone, Debug)]
+pub(super) struct DifferentialIk {
+    arm: Arc<ArmModel>,
+    config: IkConfig,
+    /// Largest joint accelerations, rad/s² or m/s², finite.
+    accelerations: Joints,
+    rest: Joints,
+    orientation: Matrix3<f64>,
+    /// Share of the secondary tasks, faded so that stopping and starting them is no jolt.
+    secondary_share: f64,
+    reference: JointReference,
+    kinematics: Kinematics,
+}
+
+impl DifferentialIk {
+    /// At rest at `q`, which is also the posture to return to.
+    pub(super) fn new(
+        arm: Arc<ArmModel>,
+        config: IkConfig,
+        accelerations: Joints,
+        q: &Joints,
+    ) -> Self {
+        let mut ik = Self {
+            arm,
+            config,
+            accelerations,
+            rest: *q,
+            orientation: Matrix3::identity(),
+            secondary_share: 0.0,
+            reference: JointReference {
+                q: *q,
+                qd: Joints::zeros(),
+                qdd: Joints::zeros(),
+            },
+            kinematics: Kinematics::new(),
+        };
+        ik.reset(q);
+        ik
+    }
+
+    /// Rest at `q`; the tip's orientation there is the one to keep. Returns where the tip is, m.
+    pub(super) fn reset(&mut self, q: &Joints) -> Vector3<f64> {
+        self.reference = JointReference {
+            q: *q,
+            qd: Joints::zeros(),
+            qdd: Joints::zeros(),
+        };
+        self.secondary_share = 0.0;
+        self.kinematics.update(&self.arm, q);
+        self.orientation = *self.kinematics.tip_rotation();
+        self.kinematics.tip()
+    }
+
+    pub(super) fn reference(&self) -> &JointReference {
+        &self.reference
+    }
+
+    /// One tick: the reference moves so that the tip is at `p` with velocity `v` when the tick ends.
+    /// `secondary` allows the motions that do not move the tip.
+    pub(super) fn step(
+        &mut self,
+        p: &Vector3<f64>,
+        v: &Vector3<f64>,
+        secondary: bool,
+    ) -> JointStep {
+        let h = self.config.dt_s;
+        let JointReference { q, qd, .. } = self.reference;
+        let ahead = q + qd * h;
+        self.kinematics.update(&self.arm, &ahead);
+        let error_m = p - self.kinematics.tip();
+        let turn = orientation_error(self.kinematics.tip_rotation(), &self.orientation);
+        let resolved = resolve(
+            &self.kinematics.jacobian(),
+            &(v + error_m * self.config.position_gain),
+            &(turn * self.config.orientation_gain),
+            &((self.rest - ahead) * self.config.posture_gain),
+            singular_below(&self.arm),
+        );
+        let towards = if secondary { 1.0 } else { 0.0 };
+        let fade = 10.0 * h;
+        self.secondary_share += (towards - self.secondary_share).clamp(-fade, fade);
+
+        let (lower, upper) = self.speed_window(&ahead);
+        let primary_share = largest_share(&Joints::zeros(), &resolved.primary, &lower, &upper);
+        let primary = resolved.primary * primary_share;
+        let secondary = resolved.secondary * self.secondary_share;
+        let wanted = primary + secondary * largest_share(&primary, &secondary, &lower, &upper);
+        let most = self.accelerations * h;
+        let change = wanted - qd;
+        let change_share = largest_share(&Joints::zeros(), &change, &-most, &most);
+        let mut next = qd + change * change_share;
+        let mut at_limit = 0;
+        for (i, joint) in self.arm.joints().iter().enumerate() {
+            let near_stop = upper[i] < joint.velocity && next[i] >= upper[i]
+                || -lower[i] < joint.velocity && next[i] <= lower[i];
+            // Slowing all joints alike for one joint's acceleration must not keep another from braking before its stop.
+            next[i] = next[i].clamp(lower[i].max(-f64::MAX), upper[i].min(f64::MAX));
+            next[i] = next[i].clamp(qd[i] - most[i], qd[i] + most[i]);
+            at_limit |= u16::from(near_stop) << i;
+        }
+        let mut q_next = q + (qd + next) * (0.5 * h);
+        for (i, joint) in self.arm.joints().iter().enumerate() {
+            let inside = q_next[i].clamp(joint.lower, joint.upper);
+            if inside != q_next[i] {
+                q_next[i] = inside;
+                next[i] = 0.0;
+                at_limit |= 1 << i;
+            }
+        }
+        self.reference = JointReference {
+            q: q_next,
+            qd: next,
+            qdd: (next - qd) / h,
+        };
+        JointStep {
+            slowed: primary_share < 1.0 || change_share < 1.0,
+            singular: resolved.sigma_min < singular_below(&self.arm),
+            at_limit,
+            error_m,
+        }
+    }
+
+    /// Joint speeds that respect the speed limit and leave room to brake, at half the acceleration limit, before the end of range.
+    fn speed_window(&self, q: &Joints) -> (Joints, Joints) {
+        let (mut lower, mut upper) = (Joints::zeros(), Joints::zeros());
+        for (i, joint) in self.arm.joints().iter().enumerate() {
+            let brake = |room: f64| {
+                let room = (room - 1e-3).max(0.0);
+                joint.velocity.min((self.accelerations[i] * room).sqrt())
+            };
+            upper[i] = brake(joint.upper - q[i]);
+            lower[i] = -brake(q[i] - joint.lower);
+        }
+        (lower, upper)
+    }
+}
+
+/// The largest share in [0, 1] of `addend` that keeps `base + share·addend` within the bounds; `base` is within them.
+pub(super) fn largest_share(base: &Joints, addend: &Joints, lower: &Joints, upper: &Joints) -> f64 {
+    let mut share = 1.0_f64;
+    for i in 0..MAX_JOINTS {
+        let bound = if addend[i] > 0.0 { upper[i] } else { lower[i] };
+        if addend[i] != 0.0 {
+            share = share.min(((bound - base[i]) / addend[i]).max(0.0));
+        }
+    }
+    share
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::SymmetricEigen;
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn smallest_eigenvalue_is_nalgebras(x in prop::array::uniform9(-2.0..2.0_f64)) {
+            let a = Matrix3::from_row_slice(&x);
+            let m = a * a.transpose();
+            let theirs = SymmetricEigen::new(m).eigenvalues.min();
+            prop_assert!((min_eigenvalue(&m) - theirs).abs() < 1e-7 * m.trace().max(1e-3));
+        }
+
+        #[test]
+        fn share_is_the_largest(base in -1.0..1.0_f64, addend in -9.0..9.0_f64) {
+            let one = |x: f64| { let mut j = Joints::zeros(); j[2] = x; j };
+            let share = largest_share(&one(base), &one(addend), &one(-1.0), &one(1.0));
+            prop_assert!((0.0..=1.0).contains(&share));
+            let reached = base + share * addend;
+            prop_assert!(reached.abs() <= 1.0 + 1e-12);
+            prop_assert!(share == 1.0 || reached.abs() > 1.0 - 1e-9);
+        }
+    }
+}

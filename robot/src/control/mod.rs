@@ -1,0 +1,18 @@
+//! From a demanded tip position to joint torques: a limited filter, differential inverse kinematics, computed torque.
+//!
+//! Nothing here allocates after construction: every vector has a fixed size and every workspace is a field. Nothing here
+//! reads a clock: a tick is `dt_s` long.
+
+mod controller;
+mod filter;
+mod ik;
+mod posture;
+mod torque;
+
+pub use controller::{
+    ClampCounts, Clamps, ControlConfig, ControlError, Controller, Demand, Output,
+};
+pub use filter::{FilterConfig, FilterError, FilterState, LimitedFilter};
+pub use ik::{IkConfig, JointReference, JointStep};
+pub use posture::{CartesianLimits, home_posture, joint_accelerations, workspace_radius};
+pub use torque::ComputedTorque;

@@ -1,0 +1,313 @@
+//! The robot's shell: accepts one operator at a time, carries bytes to the session and reports from the servo.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use quinn::{Connection, Endpoint, Incoming, SendStream, VarInt};
+use telemime_endpoint::control::{Control, ControlError, write_frame};
+use telemime_endpoint::{HostClock, quic};
+use telemime_protocol::skill::Skill;
+use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::hello::{Answer, Hello, RejectCode, negotiate};
+use telemime_protocol::wire::v1::{self, Cause, Info};
+use tokio::sync::{mpsc, watch};
+use tokio::time::{MissedTickBehavior, interval, sleep_until};
+
+use crate::servo::thread::Timing;
+use crate::servo::{Handle, Order, Report};
+use crate::session::{Counters, Output, Session, SessionConfig, TickTiming};
+
+/// How often reports are taken from the servo's ring.
+const DRAIN: Duration = Duration::from_millis(4);
+
+/// Connections that may be greeting at the same time.
+const MAX_GREETING: usize = 8;
+
+/// What the daemon needs.
+#[derive(Debug)]
+pub struct Daemon {
+    /// A server endpoint that knows which keys to accept.
+    pub endpoint: Endpoint,
+    /// The host's clock.
+    pub clock: HostClock,
+    /// What operators are told of the arm.
+    pub info: Info,
+    /// Session settings.
+    pub config: SessionConfig,
+    /// The servo's rings.
+    pub servo: Handle,
+    /// The servo's timing, where it has a thread of its own.
+    pub timing: Option<Arc<Timing>>,
+}
+
+/// Something for a log.
+#[derive(Debug, Clone)]
+pub enum Notice {
+    /// An operator has authority.
+    Connected {
+        /// The session's epoch.
+        epoch: u32,
+        /// Its address.
+        peer: std::net::SocketAddr,
+    },
+    /// It has no authority any more.
+    Disconnected {
+        /// Why.
+        why: String,
+        /// The clock's offset estimate, s, and the bound of its error, s.
+        clock: Option<(f64, f64)>,
+        /// What the session counted.
+        counters: Counters,
+    },
+    /// Somebody was turned away.
+    Refused {
+        /// Why.
+        why: String,
+    },
+    /// A servo tick, for recording.
+    Report(Box<Report>),
+    /// The path an engagement received, as it stands when the session ends: time (s, session clock), m, m/s.
+    Path(Vec<(f64, [f64; 3], [f64; 3])>),
+}
+
+struct Greeted {
+    connection: Connection,
+    control: Control,
+    hello: Hello,
+}
+
+struct Active {
+    session: Session,
+    connection: Connection,
+    send: SendStream,
+    frames: mpsc::Receiver<Result<Frame, ControlError>>,
+}
+
+impl Daemon {
+    /// Serves operators until `quit` turns true; then the arm is stopped (latched) and the endpoint closed.
+    pub async fn run(mut self, mut quit: watch::Receiver<bool>, notices: mpsc::UnboundedSender<Notice>) {
+        let (greeted_tx, mut greeted) = mpsc::channel::<Greeted>(MAX_GREETING);
+        let mut drain = interval(DRAIN);
+        drain.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut active: Option<Active> = None;
+        let mut skill: Option<Arc<Skill>> = None;
+        let mut epoch = 0;
+        loop {
+            let ended = self.flush(active.as_mut()).await;
+            if let Some(why) = ended {
+                self.end(&mut active, &mut skill, &why, &notices);
+            }
+            let due = active.as_ref().map(|a| self.clock.instant(a.session.poll_timeout().0));
+            tokio::select! {
+                biased;
+                _ = quit.wait_for(|quit| *quit) => break,
+                _ = drain.tick() => self.drain(active.as_mut(), &notices),
+                why = receive(active.as_mut(), &self.clock) => if let Some(why) = why {
+                    self.end(&mut active, &mut skill, &why, &notices);
+                },
+                () = sleep_until(due.unwrap_or_else(tokio::time::Instant::now)), if due.is_some() => {
+                    if let Some(active) = &mut active {
+                        active.session.handle_timeout(self.clock.now());
+                    }
+                }
+                incoming = self.endpoint.accept() => match incoming {
+                    Some(incoming) => {
+                        tokio::spawn(greet(incoming, greeted_tx.clone(), notices.clone()));
+                    }
+                    None => break,
+                },
+                Some(next) = greeted.recv() => {
+                    if let Some(why) = self.admit(next, &mut active, &skill, &mut epoch, &notices).await {
+                        let _ = notices.send(Notice::Refused { why });
+                    }
+                }
+            }
+        }
+        self.order(Order::Stop(Cause::LocalStop));
+        if let Some(active) = &mut active {
+            // One last drain, so that the operator hears of the stop.
+            self.clock_tick().await;
+            self.drain(Some(active), &notices);
+            let _ = self.flush(Some(active)).await;
+            let _ = active.send.finish();
+            let _ = tokio::time::timeout(Duration::from_millis(500), active.send.stopped()).await;
+        }
+        self.end(&mut active, &mut skill, "the robot daemon stops", &notices);
+        self.endpoint.close(VarInt::from_u32(0), b"the robot daemon stops");
+        self.endpoint.wait_idle().await;
+    }
+
+    async fn clock_tick(&self) {
+        sleep_until(self.clock.instant(self.clock.now().offset_by_secs(2.0 * DRAIN.as_secs_f64()))).await;
+    }
+
+    /// Gives authority, or says why not.
+    async fn admit(
+        &mut self,
+        greeted: Greeted,
+        active: &mut Option<Active>,
+        skill: &Option<Arc<Skill>>,
+        epoch: &mut u32,
+        notices: &mpsc::UnboundedSender<Notice>,
+    ) -> Option<String> {
+        let Greeted { connection, mut control, hello } = greeted;
+        let refusal = match negotiate(&hello, v1::VERSION, v1::VERSION) {
+            None => Some((
+                RejectCode::Version,
+                format!("this robot speaks version {}, you offer {} to {}", v1::VERSION, hello.min, hello.max),
+            )),
+            Some(_) if active.is_some() => {
+                Some((RejectCode::Busy, "another operator has authority".to_owned()))
+            }
+            Some(_) => None,
+        };
+        let peer = connection.remote_address();
+        if let Some((code, text)) = refusal {
+            let why = format!("{peer}: {text}");
+            // The peer may be gone already; there is nobody else to tell.
+            let _ = control.write(&Answer::Reject { code, text }.encode()).await;
+            let _ = control.send.finish();
+            tokio::spawn(async move {
+                let _ = tokio::time::timeout(Duration::from_secs(2), control.send.stopped()).await;
+                connection.close(VarInt::from_u32(2), b"rejected");
+            });
+            return Some(why);
+        }
+        *epoch += 1;
+        let ack = Answer::Ack { version: v1::VERSION, features: 0, epoch: *epoch };
+        if let Err(e) = control.write(&ack.encode()).await {
+            return Some(format!("{peer}: {e}"));
+        }
+        let (send, frames) = control.into_frames();
+        let session =
+            Session::new(self.config, self.info.clone(), *epoch, skill.clone(), self.clock.now());
+        *active = Some(Active { session, connection, send, frames });
+        let _ = notices.send(Notice::Connected { epoch: *epoch, peer });
+        None
+    }
+
+    fn order(&mut self, order: Order) {
+        // 64 orders are more than a second's worth; a full ring means a dead servo, which holds no lease.
+        let _ = self.servo.orders.push(order);
+    }
+
+    fn drain(&mut self, mut active: Option<&mut Active>, notices: &mpsc::UnboundedSender<Notice>) {
+        let timing = self.timing.as_deref().map_or_else(TickTiming::default, |t| TickTiming {
+            mean_ns: t.mean_ns.load(Ordering::Relaxed),
+            p99_ns: t.p99_ns.load(Ordering::Relaxed),
+            overruns: t.overruns.load(Ordering::Relaxed),
+        });
+        while let Ok(report) = self.servo.reports.pop() {
+            if let Some(active) = active.as_deref_mut() {
+                active.session.handle_report(&report, timing);
+            }
+            let _ = notices.send(Notice::Report(Box::new(report)));
+        }
+        while self.servo.spent.pop().is_ok() {}
+    }
+
+    /// Does what the session wants; a reason if the session is over.
+    async fn flush(&mut self, active: Option<&mut Active>) -> Option<String> {
+        let active = active?;
+        while let Some(output) = active.session.poll_output() {
+            match output {
+                Output::Control(payload) => {
+                    if let Err(e) = write_frame(&mut active.send, &payload).await {
+                        return Some(e.to_string());
+                    }
+                }
+                // Too large or unsupported cannot happen (1100 B); a lost connection shows up in `receive`.
+                Output::Datagram(bytes) => drop(active.connection.send_datagram(bytes.into())),
+                Output::Order(order) => self.order(order),
+                Output::Goodbye => return Some("the operator said goodbye".into()),
+            }
+        }
+        None
+    }
+
+    fn end(
+        &mut self,
+        active: &mut Option<Active>,
+        skill: &mut Option<Arc<Skill>>,
+        why: &str,
+        notices: &mpsc::UnboundedSender<Notice>,
+    ) {
+        let Some(mut ended) = active.take() else { return };
+        ended.session.handle_closed();
+        while let Some(output) = ended.session.poll_output() {
+            if let Output::Order(order) = output {
+                self.order(order);
+            }
+        }
+        ended.connection.close(VarInt::from_u32(0), why.as_bytes());
+        if let Some(held) = ended.session.skill() {
+            *skill = Some(held);
+        }
+        if let Some(mirror) = ended.session.mirror() {
+            let knot = |k: &telemime_protocol::checkpoint::path::DecodedKnot| {
+                (k.t.as_secs_f64(), k.x.into(), k.v.into())
+            };
+            let _ = notices.send(Notice::Path(mirror.path().knots().map(knot).collect()));
+        }
+        let now = self.clock.now();
+        let clock = ended.session.clock();
+        let clock = clock
+            .to_session(now)
+            .zip(clock.uncertainty_s(now))
+            .map(|(t, bound_s)| ((t.0 - now.0) as f64 * 1e-9, bound_s));
+        let counters = ended.session.counters();
+        let _ = notices.send(Notice::Disconnected { why: why.to_owned(), clock, counters });
+    }
+}
+
+/// The next thing the operator sends; a reason if it is the last. Never resolves without an operator.
+async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<String> {
+    let Some(active) = active else { return std::future::pending().await };
+    tokio::select! {
+        biased;
+        frame = active.frames.recv() => match frame {
+            Some(Ok(frame)) => {
+                active.session.handle_control(clock.now(), &frame).err().map(|e| format!("control message: {e}"))
+            }
+            Some(Err(e)) => Some(e.to_string()),
+            None => Some("control stream ended".into()),
+        },
+        datagram = active.connection.read_datagram() => match datagram {
+            Ok(bytes) => {
+                active.session.handle_datagram(clock.now(), &bytes);
+                None
+            }
+            Err(e) => Some(quic::explain(&e)),
+        },
+    }
+}
+
+/// Handshake and greeting, beside the running session.
+async fn greet(incoming: Incoming, greeted: mpsc::Sender<Greeted>, notices: mpsc::UnboundedSender<Notice>) {
+    let peer = incoming.remote_address();
+    let refused = |why: String| {
+        let _ = notices.send(Notice::Refused { why: format!("{peer}: {why}") });
+    };
+    let connection = match incoming.await {
+        Ok(connection) => connection,
+        Err(e) => return refused(quic::explain(&e)),
+    };
+    let mut control = match Control::accept(&connection).await {
+        Ok(control) => control,
+        Err(e) => return refused(e.to_string()),
+    };
+    match control.hello().await {
+        Ok(hello) => {
+            // The daemon has stopped if nobody receives.
+            let _ = greeted.send(Greeted { connection, control, hello }).await;
+        }
+        Err(e) => {
+            let text = e.to_string();
+            let _ = control.write(&Answer::Reject { code: RejectCode::Malformed, text: text.clone() }.encode()).await;
+            connection.close(VarInt::from_u32(3), b"malformed greeting");
+            refused(text);
+        }
+    }
+}
+

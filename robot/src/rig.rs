@@ -1,0 +1,155 @@
+//! An arm, ready to be driven: model, start posture, limits, controller and plant.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use telemime_protocol::wire::v1::{Info, RobotState};
+use telemime_sim::arm::{ArmError, ArmModel, Joints, LoadOptions, Plant, PlantError, default_urdf};
+
+use crate::control::{ControlConfig, ControlError, Controller, home_posture, workspace_radius};
+use crate::safety::SafetyConfig;
+use crate::servo::{Core, CoreConfig, Rings};
+
+/// Which arm, and how it starts.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct RigOptions {
+    /// URDF file; the built-in arm by default.
+    pub urdf: Option<PathBuf>,
+    /// Tip link and the values of joints off the chain.
+    pub load: LoadOptions,
+    /// Start posture, rad or m; a well-conditioned one is searched by default.
+    pub start: Option<Vec<f64>>,
+    /// Bandwidth, limits and tick.
+    pub control: ControlConfig,
+    /// The state machine's settings.
+    pub safety: SafetyConfig,
+}
+
+/// Why there is no rig.
+#[derive(Debug, thiserror::Error)]
+pub enum RigError {
+    /// The URDF cannot be read.
+    #[error("{path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The URDF gives no arm.
+    #[error("{urdf}: {source}")]
+    Arm {
+        /// The file.
+        urdf: String,
+        /// Why.
+        source: ArmError,
+    },
+    /// The start posture does not fit the arm.
+    #[error("start posture: {given} values for {dof} joints, or one outside its limits")]
+    Start {
+        /// Values given.
+        given: usize,
+        /// Joints of the arm.
+        dof: usize,
+    },
+    /// The controller cannot drive it.
+    #[error("{urdf}: {source}")]
+    Control {
+        /// The file.
+        urdf: String,
+        /// Why.
+        source: ControlError,
+    },
+    /// The plant cannot start there.
+    #[error(transparent)]
+    Plant(#[from] PlantError),
+}
+
+/// An arm, ready to be driven.
+#[derive(Debug, Clone)]
+pub struct Rig {
+    /// Its model.
+    pub arm: Arc<ArmModel>,
+    /// Where it starts, rad or m.
+    pub home: Joints,
+    /// The tip may go this far from where it engages, m.
+    pub radius_m: f64,
+    controller: Controller,
+    plant: Plant,
+    config: CoreConfig,
+}
+
+impl Rig {
+    /// Loads and checks everything.
+    ///
+    /// # Errors
+    /// [`RigError`].
+    pub fn load(options: &RigOptions) -> Result<Self, RigError> {
+        let (urdf, text) = match &options.urdf {
+            None => ("the built-in arm".to_owned(), default_urdf().to_owned()),
+            Some(path) => {
+                let text = std::fs::read_to_string(path)
+                    .map_err(|source| RigError::Io { path: path.clone(), source })?;
+                (path.display().to_string(), text)
+            }
+        };
+        let arm = ArmModel::from_urdf(&text, &options.load)
+            .map_err(|source| RigError::Arm { urdf: urdf.clone(), source })?;
+        let home = match &options.start {
+            None => home_posture(&arm),
+            Some(q) => arm
+                .posture(q)
+                .ok_or_else(|| RigError::Start { given: q.len(), dof: arm.dof() })?,
+        };
+        let arm = Arc::new(arm);
+        let controller = Controller::new(arm.clone(), &options.control, &home)
+            .map_err(|source| RigError::Control { urdf, source })?;
+        let radius_m = workspace_radius(&arm, &home);
+        let config = CoreConfig {
+            safety: options.safety,
+            tick_s: options.control.dt_s,
+            lag_s: controller.lag_s(),
+            radius_m,
+        };
+        Ok(Self { plant: Plant::new(arm.clone(), &home)?, arm, home, radius_m, controller, config })
+    }
+
+    /// What the operator is told.
+    pub fn info(&self) -> Info {
+        let limits = self.controller.limits();
+        let mut name = self.arm.name().to_owned();
+        while name.len() > 64 {
+            name.pop();
+        }
+        Info {
+            name,
+            joints: self.arm.dof() as u8,
+            speed_m_s: limits.v_max as f32,
+            accel_m_s2: limits.a_max as f32,
+            radius_m: self.radius_m as f32,
+            lag_s: self.config.lag_s as f32,
+            model: None,
+            state: RobotState::Idle,
+        }
+    }
+
+    /// A controller and a plant at the start posture, for a run without a session.
+    pub fn parts(&self) -> (Controller, Plant) {
+        (self.controller.clone(), self.plant.clone())
+    }
+
+    /// The servo's period, s.
+    pub fn tick_s(&self) -> f64 {
+        self.config.tick_s
+    }
+
+    /// From predicted target to tip, s.
+    pub fn lag_s(&self) -> f64 {
+        self.config.lag_s
+    }
+
+    /// A servo at rest at the start posture.
+    pub fn servo(&self, rings: Rings) -> Core {
+        Core::new(self.config, self.controller.clone(), self.plant.clone(), rings)
+    }
+}

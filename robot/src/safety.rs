@@ -1,0 +1,230 @@
+//! The state machine of DESIGN §5, on the robot's own clock. It runs inside the servo tick: no thread,
+//! socket or estimate stands between it and the arm.
+
+use telemime_endpoint::Mono;
+use telemime_protocol::wire::v1::{Cause, RobotState};
+
+/// What the state machine is set to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SafetyConfig {
+    /// Without news for this long the arm coasts, s. Above the operator's largest silence plus jitter.
+    pub coast_after_s: f64,
+    /// No lease runs longer than this, whatever the operator asks, s.
+    pub max_lease_s: f64,
+}
+
+impl Default for SafetyConfig {
+    fn default() -> Self {
+        Self { coast_after_s: 0.26, max_lease_s: 1.0 }
+    }
+}
+
+/// State, cause and the two deadlines.
+#[derive(Debug, Clone)]
+pub struct Safety {
+    config: SafetyConfig,
+    state: RobotState,
+    cause: Cause,
+    transitions: u32,
+    lease_until: Mono,
+    last_news: Mono,
+}
+
+impl Safety {
+    /// Idle.
+    pub fn new(config: SafetyConfig) -> Self {
+        Self {
+            config,
+            state: RobotState::Idle,
+            cause: Cause::Requested,
+            transitions: 0,
+            lease_until: Mono(i64::MIN),
+            last_news: Mono(i64::MIN),
+        }
+    }
+
+    /// The state.
+    pub fn state(&self) -> RobotState {
+        self.state
+    }
+
+    /// Why it is the state.
+    pub fn cause(&self) -> Cause {
+        self.cause
+    }
+
+    /// Counts every change.
+    pub fn transitions(&self) -> u32 {
+        self.transitions
+    }
+
+    /// Whether motion is authorised.
+    pub fn is_following(&self) -> bool {
+        matches!(self.state, RobotState::Engaged | RobotState::Coasting)
+    }
+
+    /// An operator has, or loses, authority.
+    pub fn set_operator(&mut self, present: bool) {
+        match (present, self.state) {
+            (true, RobotState::Idle) => self.enter(RobotState::Ready, Cause::Requested),
+            (false, RobotState::Ready) => self.enter(RobotState::Idle, Cause::ConnectionLost),
+            (false, RobotState::Engaged | RobotState::Coasting) => {
+                self.enter(RobotState::Holding, Cause::ConnectionLost);
+            }
+            _ => {}
+        }
+    }
+
+    /// Engages, from `Ready` or `Holding` only; says whether.
+    pub fn engage(&mut self, now: Mono, lease_s: f64) -> bool {
+        if !matches!(self.state, RobotState::Ready | RobotState::Holding) {
+            return false;
+        }
+        self.enter(RobotState::Engaged, Cause::Requested);
+        self.news(now, lease_s);
+        true
+    }
+
+    /// News arrived and authorises motion for `lease_s` from `now` (or from when it should have arrived).
+    pub fn news(&mut self, now: Mono, lease_s: f64) {
+        if !self.is_following() {
+            return;
+        }
+        self.last_news = self.last_news.max(now);
+        let lease_s = lease_s.clamp(0.0, self.config.max_lease_s);
+        self.lease_until = self.lease_until.max(now.offset_by_secs(lease_s));
+        if self.state == RobotState::Coasting {
+            self.enter(RobotState::Engaged, Cause::NewsArrived);
+        }
+    }
+
+    /// The clutch is let go, or the motion is over.
+    pub fn release(&mut self, cause: Cause) {
+        if self.is_following() {
+            self.enter(RobotState::Ready, cause);
+        }
+    }
+
+    /// Stops and holds until a fresh engage.
+    pub fn hold(&mut self, cause: Cause) {
+        if self.is_following() {
+            self.enter(RobotState::Holding, cause);
+        }
+    }
+
+    /// Emergency stop, from any state, latched.
+    pub fn stop(&mut self, cause: Cause) {
+        if self.state != RobotState::Stopped {
+            self.enter(RobotState::Stopped, cause);
+        }
+    }
+
+    /// Leaves the latched stop, on purpose.
+    pub fn reset(&mut self, operator_present: bool) {
+        if self.state == RobotState::Stopped {
+            let next = if operator_present { RobotState::Ready } else { RobotState::Idle };
+            self.enter(next, Cause::Requested);
+        }
+    }
+
+    /// Checks the deadlines; to be called first in every tick.
+    pub fn tick(&mut self, now: Mono) {
+        if !self.is_following() {
+            return;
+        }
+        if now >= self.lease_until {
+            self.enter(RobotState::Holding, Cause::LeaseExpired);
+        } else if self.state == RobotState::Engaged && now >= self.coast_from() {
+            self.enter(RobotState::Coasting, Cause::NewsLate);
+        }
+    }
+
+    /// Factor on the speed limit, in [0, 1]: 1 while engaged, fading to 0 at the end of the lease.
+    pub fn speed_scale(&self, now: Mono) -> f64 {
+        match self.state {
+            RobotState::Engaged => 1.0,
+            RobotState::Coasting => {
+                let span_s = self.lease_until.secs_since(self.coast_from());
+                (self.lease_until.secs_since(now) / span_s.max(1e-3)).clamp(0.0, 1.0)
+            }
+            _ => 0.0,
+        }
+    }
+
+    fn coast_from(&self) -> Mono {
+        self.last_news.offset_by_secs(self.config.coast_after_s)
+    }
+
+    fn enter(&mut self, state: RobotState, cause: Cause) {
+        if !self.is_following() {
+            self.lease_until = Mono(i64::MIN);
+            self.last_news = Mono(i64::MIN);
+        }
+        self.state = state;
+        self.cause = cause;
+        self.transitions = self.transitions.wrapping_add(1);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: i64 = 1_000_000;
+
+    fn engaged() -> Safety {
+        let mut safety = Safety::new(SafetyConfig::default());
+        safety.set_operator(true);
+        assert!(safety.engage(Mono(0), 0.45));
+        safety
+    }
+
+    #[test]
+    fn silence_coasts_fades_and_holds_for_good() {
+        let mut safety = engaged();
+        safety.tick(Mono(259 * MS));
+        assert_eq!(safety.state(), RobotState::Engaged);
+        safety.tick(Mono(260 * MS));
+        assert_eq!((safety.state(), safety.speed_scale(Mono(260 * MS))), (RobotState::Coasting, 1.0));
+        assert!((safety.speed_scale(Mono(355 * MS)) - 0.5).abs() < 1e-9);
+        safety.tick(Mono(450 * MS));
+        assert_eq!((safety.state(), safety.cause()), (RobotState::Holding, Cause::LeaseExpired));
+        safety.news(Mono(451 * MS), 0.45);
+        safety.tick(Mono(451 * MS));
+        assert_eq!(safety.state(), RobotState::Holding, "never re-engages by itself");
+        assert!(safety.engage(Mono(500 * MS), 0.45));
+    }
+
+    #[test]
+    fn news_while_coasting_resumes() {
+        let mut safety = engaged();
+        safety.tick(Mono(300 * MS));
+        assert_eq!(safety.state(), RobotState::Coasting);
+        safety.news(Mono(301 * MS), 0.45);
+        assert_eq!((safety.state(), safety.speed_scale(Mono(302 * MS))), (RobotState::Engaged, 1.0));
+    }
+
+    #[test]
+    fn the_stop_is_latched_and_every_lease_is_bounded() {
+        let mut safety = engaged();
+        safety.news(Mono(0), 1e9);
+        safety.tick(Mono(1001 * MS));
+        assert_eq!(safety.state(), RobotState::Holding);
+        safety.stop(Cause::LocalStop);
+        assert!(!safety.engage(Mono(0), 0.45));
+        safety.set_operator(false);
+        safety.set_operator(true);
+        assert_eq!(safety.state(), RobotState::Stopped);
+        safety.reset(true);
+        assert_eq!(safety.state(), RobotState::Ready);
+    }
+
+    #[test]
+    fn a_lost_connection_holds_and_a_new_operator_does_not_move_the_arm() {
+        let mut safety = engaged();
+        safety.set_operator(false);
+        assert_eq!((safety.state(), safety.cause()), (RobotState::Holding, Cause::ConnectionLost));
+        safety.set_operator(true);
+        assert!(!safety.is_following());
+    }
+}

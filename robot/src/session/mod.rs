@@ -1,0 +1,389 @@
+//! The robot's side of a session, sans-IO: bytes and reports in, bytes and orders out.
+//!
+//! Call order: any `handle_*`, then [`Session::poll_output`] until it is empty, then [`Session::poll_timeout`]
+//! for when to call [`Session::handle_timeout`].
+
+mod motion;
+#[cfg(test)]
+mod tests;
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use nalgebra::{Quaternion, UnitQuaternion};
+use telemime_endpoint::Mono;
+use telemime_protocol::checkpoint::Plan;
+use telemime_protocol::skill::Skill;
+use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::DecodeError;
+use telemime_protocol::wire::codec;
+use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::v1::{
+    Cause, Drive, Engage, Info, MAX_PLAN_LEN, Message, ModelId, OperatorControl, OperatorDatagram, Refusal,
+    RobotControl, RobotDatagram, RobotState, Telemetry,
+};
+
+use crate::clock::{SessionClock, Slew};
+use crate::servo::{Engagement, Order, Report, Source, Trajectory};
+use motion::Mirror;
+
+/// Pings in quick succession at the start, so that the clock is known before the first engage.
+const QUICK_PINGS: u32 = 8;
+const QUICK_PING_S: f64 = 0.02;
+const PING_S: f64 = 0.25;
+
+/// What a session is set to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SessionConfig {
+    /// Interval of telemetry, s.
+    pub telemetry_s: f64,
+    /// A sample that took longer than this to arrive authorises nothing beyond, s.
+    pub max_delay_s: f64,
+}
+
+impl Default for SessionConfig {
+    fn default() -> Self {
+        Self { telemetry_s: 0.05, max_delay_s: 0.5 }
+    }
+}
+
+/// What a session wants done.
+#[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "moved once, into the servo's ring")]
+pub enum Output {
+    /// A message for the control stream, not yet framed.
+    Control(Vec<u8>),
+    /// A datagram.
+    Datagram(Vec<u8>),
+    /// An order for the servo.
+    Order(Order),
+    /// The operator said goodbye.
+    Goodbye,
+}
+
+/// How the servo's timing looks.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct TickTiming {
+    /// Mean work, ns.
+    pub mean_ns: u32,
+    /// 99th percentile, ns.
+    pub p99_ns: u32,
+    /// Late ticks.
+    pub overruns: u32,
+}
+
+/// What the session counts.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Motions received, duplicates not counted.
+    pub received: u32,
+    /// Datagrams dropped: malformed, foreign, late or impossible.
+    pub dropped: u32,
+}
+
+/// One operator's session.
+#[derive(Debug)]
+pub struct Session {
+    config: SessionConfig,
+    info: Info,
+    epoch: u32,
+    clock: SessionClock,
+    skill: Option<Arc<Skill>>,
+    plan: Option<(u32, Plan<3>)>,
+    mirror: Option<Mirror>,
+    engagement: u32,
+    acknowledged: u32,
+    newest_seq: u32,
+    delay_s: f64,
+    counters: Counters,
+    report: Option<Report>,
+    transitions: Option<u32>,
+    timing: TickTiming,
+    telemetry_seq: u32,
+    pings: u32,
+    next_ping: Mono,
+    next_telemetry: Mono,
+    outputs: VecDeque<Output>,
+}
+
+impl Session {
+    /// A session that begins at `now` with authority. `skill` is the model still held from before.
+    pub fn new(
+        config: SessionConfig,
+        mut info: Info,
+        epoch: u32,
+        skill: Option<Arc<Skill>>,
+        now: Mono,
+    ) -> Self {
+        info.model = skill.as_ref().map(|s| s.id().0);
+        let mut session = Self {
+            config,
+            epoch,
+            clock: SessionClock::default(),
+            skill,
+            plan: None,
+            mirror: None,
+            engagement: 0,
+            acknowledged: 0,
+            newest_seq: 0,
+            delay_s: 0.0,
+            counters: Counters::default(),
+            report: None,
+            transitions: None,
+            timing: TickTiming::default(),
+            telemetry_seq: 0,
+            pings: 0,
+            next_ping: now,
+            next_telemetry: now,
+            outputs: VecDeque::new(),
+            info,
+        };
+        session.send(&RobotControl::Info(session.info.clone()));
+        session.order(Order::Operator(true));
+        session
+    }
+
+    /// The model held, for the next session.
+    pub fn skill(&self) -> Option<Arc<Skill>> {
+        self.skill.clone()
+    }
+
+    /// The clock estimate.
+    pub fn clock(&self) -> &SessionClock {
+        &self.clock
+    }
+
+    /// The counters.
+    pub fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// The path received in mirror, if one is being followed.
+    pub fn mirror(&self) -> Option<&Mirror> {
+        self.mirror.as_ref()
+    }
+
+    /// A frame from the control stream.
+    ///
+    /// # Errors
+    /// [`DecodeError`] for a frame that may not be ignored; the session is then over.
+    pub fn handle_control(&mut self, now: Mono, frame: &Frame) -> Result<(), DecodeError> {
+        let message = match OperatorControl::decode(&frame.payload) {
+            Ok(message) => message,
+            Err(_) if frame.ignorable => return Ok(()),
+            Err(e) => return Err(e),
+        };
+        match message {
+            OperatorControl::Model { id, bytes } => self.store_model(id, &bytes),
+            OperatorControl::Plan { id, bytes } => match codec::decode::<Plan<3>, MAX_PLAN_LEN>(&bytes) {
+                Ok(plan) => {
+                    self.plan = Some((id, plan));
+                    self.send(&RobotControl::PlanStored { id });
+                }
+                Err(_) => self.refuse(Refusal::BadPlan),
+            },
+            OperatorControl::Engage(engage) => {
+                if let Err(reason) = self.engage(now, &engage) {
+                    self.refuse(reason);
+                }
+            }
+            OperatorControl::Release { engagement } => {
+                if engagement == self.engagement {
+                    self.order(Order::Release);
+                }
+            }
+            OperatorControl::EmergencyStop => self.order(Order::Stop(Cause::OperatorStop)),
+            OperatorControl::Reset => self.order(Order::Reset { operator: true }),
+            OperatorControl::Goodbye => self.outputs.push_back(Output::Goodbye),
+        }
+        Ok(())
+    }
+
+    /// A datagram. Nothing in it can end the session: what is wrong is dropped and counted.
+    pub fn handle_datagram(&mut self, now: Mono, bytes: &[u8]) {
+        let taken = match OperatorDatagram::decode(bytes) {
+            Ok(OperatorDatagram::Motion(motion)) => self.on_motion(now, &motion),
+            Ok(OperatorDatagram::Go { epoch, engagement, seq, t_us, lease_ms }) => {
+                self.on_go(now, epoch, engagement, seq, t_us, lease_ms)
+            }
+            Ok(OperatorDatagram::Pong { epoch, t1_us, t2_us, t3_us }) if epoch == self.epoch => {
+                let stamp = |us: i64| Stamp(us.saturating_mul(1000));
+                self.clock.observe(Mono(t1_us.saturating_mul(1000)), stamp(t2_us), stamp(t3_us), now);
+                self.follow_clock(now);
+                true
+            }
+            Ok(OperatorDatagram::Stop { epoch }) if epoch == self.epoch => {
+                self.order(Order::Stop(Cause::OperatorStop));
+                true
+            }
+            Ok(OperatorDatagram::Pong { .. } | OperatorDatagram::Stop { .. }) | Err(_) => false,
+        };
+        if !taken {
+            self.counters.dropped += 1;
+        }
+    }
+
+    /// The servo's report of a tick.
+    pub fn handle_report(&mut self, report: &Report, timing: TickTiming) {
+        self.timing = timing;
+        let changed = self.transitions != Some(report.transitions);
+        self.transitions = Some(report.transitions);
+        self.report = Some(*report);
+        if self.engagement != 0 && report.engagement == self.engagement && self.acknowledged != self.engagement
+        {
+            self.acknowledged = self.engagement;
+            let t_us = self.clock.to_session(report.engaged_at).map_or(0, |t| t.0 / 1000);
+            self.send(&RobotControl::Engaged {
+                engagement: report.engagement,
+                t_us,
+                hand_m: report.mapping.hand_m.cast::<f32>().into(),
+                tip_m: report.mapping.tip_m.cast::<f32>().into(),
+            });
+        }
+        if changed {
+            self.send(&RobotControl::State { state: report.state, cause: report.cause });
+        }
+    }
+
+    /// Something is due.
+    pub fn handle_timeout(&mut self, now: Mono) {
+        if now >= self.next_ping {
+            self.pings += 1;
+            let gap_s = if self.pings < QUICK_PINGS { QUICK_PING_S } else { PING_S };
+            self.next_ping = now.offset_by_secs(gap_s);
+            let ping = RobotDatagram::Ping { epoch: self.epoch, t1_us: now.0 / 1000 };
+            self.outputs.push_back(Output::Datagram(ping.encode()));
+        }
+        if now >= self.next_telemetry {
+            self.next_telemetry = now.offset_by_secs(self.config.telemetry_s);
+            if let Some(telemetry) = self.telemetry(now) {
+                let datagram = RobotDatagram::Telemetry(telemetry).encode();
+                self.outputs.push_back(Output::Datagram(datagram));
+            }
+        }
+    }
+
+    /// The connection ended: the operator has no authority any more.
+    pub fn handle_closed(&mut self) {
+        self.order(Order::Operator(false));
+    }
+
+    /// What to do next.
+    pub fn poll_output(&mut self) -> Option<Output> {
+        self.outputs.pop_front()
+    }
+
+    /// When to call [`Session::handle_timeout`], and for what.
+    pub fn poll_timeout(&self) -> (Mono, &'static str) {
+        if self.next_ping < self.next_telemetry {
+            (self.next_ping, "ask for the session clock")
+        } else {
+            (self.next_telemetry, "send telemetry")
+        }
+    }
+
+    fn store_model(&mut self, id: ModelId, bytes: &[u8]) {
+        match Skill::from_bytes(bytes) {
+            Ok(skill) if skill.id().0 == id => {
+                self.skill = Some(Arc::new(skill));
+                self.send(&RobotControl::ModelStored { id });
+            }
+            _ => self.refuse(Refusal::BadModel),
+        }
+    }
+
+    fn engage(&mut self, now: Mono, engage: &Engage) -> Result<(), Refusal> {
+        let report = self.report.as_ref().ok_or(Refusal::Moving)?;
+        match report.state {
+            RobotState::Stopped => return Err(Refusal::Stopped),
+            RobotState::Engaged | RobotState::Coasting => return Err(Refusal::AlreadyEngaged),
+            RobotState::Idle | RobotState::Ready | RobotState::Holding => {}
+        }
+        if report.moving {
+            return Err(Refusal::Moving);
+        }
+        if engage.engagement <= self.engagement {
+            return Err(Refusal::OldEngagement);
+        }
+        let [w, x, y, z] = engage.rotation.map(f64::from);
+        let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+        // From here on an estimate may be applied at once: nothing is being followed.
+        self.clock.slew(now, false);
+        let (source, mirror) = match &engage.drive {
+            Drive::Mirror { state, model, params } => {
+                let mirror = Mirror::new(engage.path_bound_um).ok_or(Refusal::BadMapping)?;
+                let state = state.dequantise();
+                let valid_at = self.clock.to_mono(state.t).ok_or(Refusal::ClockUnknown)?;
+                let age_s = now.secs_since(valid_at);
+                if !(-self.config.max_delay_s..=self.config.max_delay_s).contains(&age_s) {
+                    return Err(Refusal::StaleReference);
+                }
+                let forecast = self.forecast(&state, *model, &params.dequantise());
+                (Source::Mirror { forecast, valid_at }, Some(mirror))
+            }
+            Drive::Play { plan } => {
+                let (_, held) = self.plan.as_ref().filter(|(id, _)| id == plan).ok_or(Refusal::BadPlan)?;
+                let spline = held.spline().map_err(|_| Refusal::BadPlan)?;
+                let duration_s = spline.span_s().1;
+                (Source::Play(Box::new(Trajectory { spline, duration_s })), None)
+            }
+        };
+        self.engagement = engage.engagement;
+        self.mirror = mirror;
+        self.order(Order::Engage(Engagement {
+            number: engage.engagement,
+            source,
+            scale: f64::from(engage.scale),
+            rotation,
+            lease_s: f64::from(engage.lease_ms) * 1e-3,
+        }));
+        Ok(())
+    }
+
+    fn follow_clock(&mut self, now: Mono) {
+        let following =
+            self.report.is_some_and(|r| matches!(r.state, RobotState::Engaged | RobotState::Coasting));
+        if self.clock.slew(now, following) == Slew::Step {
+            self.order(Order::Hold(Cause::ClockStep));
+        }
+    }
+
+    fn telemetry(&mut self, now: Mono) -> Option<Telemetry> {
+        let report = self.report?;
+        self.telemetry_seq += 1;
+        let milliseconds = |s: f64| (s * 1e3).round().clamp(0.0, f64::from(u16::MAX)) as u16;
+        let uncertainty_us = self.clock.uncertainty_s(now).map_or(f64::from(u32::MAX), |s| s * 1e6);
+        Some(Telemetry {
+            epoch: self.epoch,
+            seq: self.telemetry_seq,
+            state: report.state,
+            engagement: report.engagement,
+            t_us: self.clock.to_session(report.at).map_or(0, |t| t.0 / 1000),
+            clock_uncertainty_us: uncertainty_us as u32,
+            age_ms: milliseconds(report.age_s),
+            delay_ms: milliseconds(self.delay_s),
+            path_frontier: self.mirror.as_ref().map_or(0, Mirror::frontier),
+            received: self.counters.received,
+            newest_seq: self.newest_seq,
+            dropped: self.counters.dropped,
+            clamps: report.clamps,
+            tick_mean_ns: self.timing.mean_ns,
+            tick_p99_ns: self.timing.p99_ns,
+            overruns: self.timing.overruns,
+            tip_m: report.tip_m.cast::<f32>().into(),
+            q: report.q.iter().take(usize::from(self.info.joints)).map(|&v| v as f32).collect(),
+        })
+    }
+
+    fn refuse(&mut self, reason: Refusal) {
+        self.send(&RobotControl::Refused { reason });
+    }
+
+    fn send(&mut self, message: &RobotControl) {
+        self.outputs.push_back(Output::Control(message.encode()));
+    }
+
+    fn order(&mut self, order: Order) {
+        self.outputs.push_back(Output::Order(order));
+    }
+}

@@ -1,0 +1,140 @@
+//! What a motion message does: the future goes to the servo, the path into the record.
+
+use telemime_endpoint::Mono;
+use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid};
+use telemime_protocol::predict::{Forecast, HandState, Params};
+use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::knots;
+use telemime_protocol::wire::v1::{Motion, Refusal, model_tag};
+
+use super::Session;
+use crate::servo::Order;
+
+/// Knots of the path kept: minutes of motion, a fixed amount of memory.
+const PATH_KNOTS: usize = 8192;
+
+/// A mirror engagement: the path received so far.
+#[derive(Debug)]
+pub struct Mirror {
+    grid: PathGrid,
+    path: PathDecoder,
+    frontier: u32,
+    newest_t: Stamp,
+    diverged: bool,
+}
+
+impl Session {
+    /// A motion; says whether it was of use.
+    pub(super) fn on_motion(&mut self, now: Mono, motion: &Motion) -> bool {
+        if motion.epoch != self.epoch || motion.engagement != self.engagement {
+            return false;
+        }
+        let Some(mirror) = &mut self.mirror else { return false };
+        let state = motion.state.dequantise();
+        let Some(valid_at) = self.clock.to_mono(state.t) else { return false };
+        let age_s = now.secs_since(valid_at);
+        if age_s < -self.config.max_delay_s {
+            return false;
+        }
+        mirror.take_knots(motion);
+        let fresh = motion.seq > self.newest_seq;
+        if fresh {
+            self.newest_seq = motion.seq;
+            self.counters.received += 1;
+        }
+        // Newest by sample time: reordering and repetition never take the robot back.
+        if state.t <= mirror.newest_t {
+            return fresh;
+        }
+        mirror.newest_t = state.t;
+        let lease_s = f64::from(motion.lease_ms) * 1e-3 - (age_s - self.config.max_delay_s).max(0.0);
+        if lease_s <= 0.0 {
+            return false;
+        }
+        self.delay_s = age_s;
+        let diverged = mirror.diverged;
+        let model = if diverged { 0 } else { motion.model };
+        let mut forecast = self.forecast(&state, model, &motion.params.dequantise());
+        let checked = motion.checksum.filter(|_| !diverged && self.predicts_with(motion.model));
+        if checked.is_some_and(|sum| sum != forecast.checksum()) {
+            forecast = Forecast::constant_velocity(&state, &motion.params.dequantise());
+            if let Some(mirror) = &mut self.mirror {
+                mirror.diverged = true;
+            }
+            self.refuse(Refusal::Diverged);
+        }
+        self.order(Order::Track { forecast, valid_at, lease_s });
+        true
+    }
+
+    /// A go; says whether it was of use.
+    pub(super) fn on_go(
+        &mut self,
+        now: Mono,
+        epoch: u32,
+        engagement: u32,
+        seq: u32,
+        t_us: i64,
+        lease_ms: u16,
+    ) -> bool {
+        if epoch != self.epoch || engagement != self.engagement || self.mirror.is_some() {
+            return false;
+        }
+        if seq <= self.newest_seq {
+            return false;
+        }
+        let Some(sent_at) = self.clock.to_mono(Stamp(t_us.saturating_mul(1000))) else { return false };
+        let age_s = now.secs_since(sent_at);
+        let lease_s = f64::from(lease_ms) * 1e-3 - (age_s - self.config.max_delay_s).max(0.0);
+        if lease_s <= 0.0 {
+            return false;
+        }
+        self.newest_seq = seq;
+        self.counters.received += 1;
+        self.delay_s = age_s;
+        self.order(Order::Extend { lease_s });
+        true
+    }
+
+    /// The prediction from `state`: by the model named, or by constant velocity until it has arrived.
+    pub(super) fn forecast(&self, state: &HandState, model: u16, params: &Params) -> Forecast {
+        match &self.skill {
+            Some(skill) if self.predicts_with(model) => skill.predictor().forecast(state, params),
+            _ => Forecast::constant_velocity(state, params),
+        }
+    }
+
+    fn predicts_with(&self, model: u16) -> bool {
+        model != 0 && self.skill.as_ref().is_some_and(|skill| model_tag(&skill.id().0) == model)
+    }
+}
+
+impl Mirror {
+    /// An empty path on the grid of `bound_um`; `None` if there is no such grid.
+    pub(super) fn new(bound_um: u32) -> Option<Self> {
+        let grid = PathGrid::for_bound(f64::from(bound_um) * 1e-6).ok()?;
+        let path = PathDecoder::new(grid, PATH_KNOTS);
+        Some(Self { grid, path, frontier: 0, newest_t: Stamp(i64::MIN), diverged: false })
+    }
+
+    /// Knots held without a gap.
+    pub fn frontier(&self) -> u32 {
+        self.frontier
+    }
+
+    /// The path received.
+    pub fn path(&self) -> &PathDecoder {
+        &self.path
+    }
+
+    fn take_knots(&mut self, motion: &Motion) {
+        // A message that begins beyond the frontier leaves a gap: its knots come again.
+        let Some(known) = self.frontier.checked_sub(motion.first_knot) else { return };
+        for knot in knots::unpack(&motion.state, self.grid, &motion.knots).skip(known as usize) {
+            if self.path.append(&knot).is_err() {
+                return;
+            }
+            self.frontier += 1;
+        }
+    }
+}

@@ -1,0 +1,8 @@
+//! Where the two daemons meet. *Virtual*: both run on one thread, on real quinn over an in-memory
+//! network, under a paused clock; everything else is as in the processes.
+
+mod net;
+mod pair;
+
+pub use net::{Network, Socket};
+pub use pair::{Operator, Pair, PairError, Robot, run_virtual};

@@ -1,0 +1,170 @@
+//! An in-memory network: sockets that behave like UDP, links as in [`telemime_sim::link`].
+
+use std::collections::{BTreeMap, VecDeque};
+use std::fmt;
+use std::io::{self, IoSliceMut};
+use std::net::SocketAddr;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard};
+use std::task::{Context, Poll, Waker};
+use std::time::Duration;
+
+use quinn::udp::{RecvMeta, Transmit};
+use quinn::{AsyncUdpSocket, UdpPoller};
+use telemime_endpoint::meter::IP_UDP_HEADER;
+use telemime_sim::link::{Fate, Link, LinkConfig};
+use tokio::time::{Instant, sleep_until};
+
+#[derive(Default)]
+struct Inbox {
+    packets: VecDeque<(SocketAddr, Vec<u8>)>,
+    waker: Option<Waker>,
+}
+
+struct State {
+    epoch: Instant,
+    inboxes: BTreeMap<SocketAddr, Inbox>,
+    links: BTreeMap<(SocketAddr, SocketAddr), Link>,
+    down: bool,
+}
+
+/// Sockets and the links between them, on tokio's clock.
+#[derive(Clone)]
+pub struct Network(Arc<Mutex<State>>);
+
+impl Default for Network {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Network {
+    /// No sockets, perfect wires.
+    pub fn new() -> Self {
+        Self(Arc::new(Mutex::new(State {
+            epoch: Instant::now(),
+            inboxes: BTreeMap::new(),
+            links: BTreeMap::new(),
+            down: false,
+        })))
+    }
+
+    /// A socket at `addr`.
+    pub fn socket(&self, addr: SocketAddr) -> Arc<Socket> {
+        self.state().inboxes.insert(addr, Inbox::default());
+        Arc::new(Socket { network: self.clone(), addr })
+    }
+
+    /// Sets the link from `from` to `to`.
+    pub fn link(&self, from: SocketAddr, to: SocketAddr, config: LinkConfig, seed: u64) {
+        self.state().links.insert((from, to), Link::new(config, seed));
+    }
+
+    /// Cuts every link, or restores them. Packets already on their way arrive.
+    pub fn set_down(&self, down: bool) {
+        self.state().down = down;
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.0.lock().expect("no code panics while it holds the network")
+    }
+
+    fn send(&self, from: SocketAddr, to: SocketAddr, packet: &[u8]) {
+        let mut state = self.state();
+        let now_ns = state.epoch.elapsed().as_nanos() as i64;
+        let len = packet.len() + IP_UDP_HEADER as usize;
+        let fate = match state.links.get_mut(&(from, to)) {
+            Some(link) => link.send(now_ns, len),
+            None => Fate::Deliver { at_ns: now_ns },
+        };
+        let Fate::Deliver { at_ns } = fate else { return };
+        if state.down {
+            return;
+        }
+        let at = state.epoch + Duration::from_nanos(at_ns.max(0) as u64);
+        drop(state);
+        let (network, packet) = (self.clone(), packet.to_vec());
+        tokio::spawn(async move {
+            sleep_until(at).await;
+            network.deliver(from, to, packet);
+        });
+    }
+
+    fn deliver(&self, from: SocketAddr, to: SocketAddr, packet: Vec<u8>) {
+        let mut state = self.state();
+        let Some(inbox) = state.inboxes.get_mut(&to) else { return };
+        inbox.packets.push_back((from, packet));
+        if let Some(waker) = inbox.waker.take() {
+            waker.wake();
+        }
+    }
+}
+
+/// One end of the network.
+pub struct Socket {
+    network: Network,
+    addr: SocketAddr,
+}
+
+impl fmt::Debug for Socket {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Socket({})", self.addr)
+    }
+}
+
+#[derive(Debug)]
+struct AlwaysWritable;
+
+impl UdpPoller for AlwaysWritable {
+    fn poll_writable(self: Pin<&mut Self>, _cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Poll::Ready(Ok(()))
+    }
+}
+
+impl AsyncUdpSocket for Socket {
+    fn create_io_poller(self: Arc<Self>) -> Pin<Box<dyn UdpPoller>> {
+        Box::pin(AlwaysWritable)
+    }
+
+    fn try_send(&self, transmit: &Transmit<'_>) -> io::Result<()> {
+        let segment = transmit.segment_size.unwrap_or(transmit.contents.len()).max(1);
+        for packet in transmit.contents.chunks(segment) {
+            self.network.send(self.addr, transmit.destination, packet);
+        }
+        Ok(())
+    }
+
+    fn poll_recv(
+        &self,
+        cx: &mut Context<'_>,
+        bufs: &mut [IoSliceMut<'_>],
+        meta: &mut [RecvMeta],
+    ) -> Poll<io::Result<usize>> {
+        let mut state = self.network.state();
+        let Some(inbox) = state.inboxes.get_mut(&self.addr) else {
+            return Poll::Ready(Err(io::ErrorKind::NotConnected.into()));
+        };
+        let mut received = 0;
+        while received < bufs.len().min(meta.len())
+            && let Some((from, packet)) = inbox.packets.pop_front()
+        {
+            let len = packet.len().min(bufs[received].len());
+            bufs[received][..len].copy_from_slice(&packet[..len]);
+            meta[received] = RecvMeta { addr: from, len, stride: len, ecn: None, dst_ip: None };
+            received += 1;
+        }
+        if received > 0 {
+            return Poll::Ready(Ok(received));
+        }
+        inbox.waker = Some(cx.waker().clone());
+        Poll::Pending
+    }
+
+    fn local_addr(&self) -> io::Result<SocketAddr> {
+        Ok(self.addr)
+    }
+
+    fn may_fragment(&self) -> bool {
+        false
+    }
+}

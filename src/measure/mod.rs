@@ -1,0 +1,7 @@
+//! The figures by which a run is judged; `docs/experiments.md` defines them.
+
+mod follow;
+mod track;
+
+pub use follow::{Follow, follow};
+pub use track::{Track, TrackError, rmse_m, sample_and_hold};
