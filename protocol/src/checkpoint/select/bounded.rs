@@ -4,8 +4,12 @@ use nalgebra::SVector;
 
 use super::super::{Checkpoint, CheckpointError, Grid, MAX_POINTS, Plan, check_series};
 
-/// Sample evaluations spent on making a sufficient choice smaller: about half a second.
-const REFINING_EFFORT: usize = 1 << 23;
+/// Sample evaluations spent on making a sufficient choice smaller: a few tenths of a second.
+const REFINING_EFFORT: usize = 1 << 22;
+
+/// The choice starts with a curve within this many bounds of the samples. Which start ends with fewer
+/// points depends on the motion, so both are tried.
+const STARTS: [f64; 2] = [1.0, 8.0];
 
 /// Checkpoints of the motion `y` (m) at times `t` (s from its start, not negative, increasing) whose
 /// decoded curve passes within `bound_m` of *every* sample.
@@ -25,20 +29,29 @@ pub fn bounded<const D: usize>(
     let coarse = Grid::for_bound(bound_m)?;
     check_series(t, y)?;
     let slopes = slopes(t, y);
-    let mut chooser = Chooser {
-        t,
-        y,
-        slopes: &slopes,
-        bound_m,
-        grid: coarse,
-        effort: 0,
+    let attempt = |grid, near| {
+        let mut chooser = Chooser {
+            t,
+            y,
+            slopes: &slopes,
+            bound_m,
+            grid,
+            effort: 0,
+        };
+        chooser.choose(near)
     };
-    match chooser.choose() {
+    let fewest = |grid| {
+        let [sure, bold] = STARTS.map(|near| attempt(grid, near));
+        match (sure, bold) {
+            (Ok(sure), Ok(bold)) if bold.len() < sure.len() => Ok(bold),
+            (Ok(plan), _) | (Err(_), Ok(plan)) => Ok(plan),
+            (Err(e), Err(_)) => Err(e),
+        }
+    };
+    match fewest(coarse) {
         // Sample times off the millisecond grid, and a bound tighter than that rounding.
         Err(CheckpointError::Unreachable { .. } | CheckpointError::Unordered { .. }) => {
-            chooser.grid = coarse.with_fine_ticks();
-            chooser.effort = 0;
-            chooser.choose()
+            fewest(coarse.with_fine_ticks())
         }
         other => other,
     }
@@ -54,8 +67,8 @@ struct Chooser<'a, const D: usize> {
 }
 
 impl<const D: usize> Chooser<'_, D> {
-    fn choose(&mut self) -> Result<Plan<D>, CheckpointError> {
-        let mut kept = self.start();
+    fn choose(&mut self, near: f64) -> Result<Plan<D>, CheckpointError> {
+        let mut kept = self.start(near);
         loop {
             let errors = self.errors(&kept)?;
             let (worst, &error_m) = errors
@@ -84,9 +97,9 @@ impl<const D: usize> Chooser<'_, D> {
         self.plan(&kept)
     }
 
-    /// Both ends, and equal shares of ∫√|x''| dt between them: half as many again until the bound
-    /// holds. Where it never does, greedy insertion goes on from there.
-    fn start(&mut self) -> Vec<usize> {
+    /// Both ends, and equal shares of ∫√|x''| dt between them: half as many again until the curve
+    /// is within `near` bounds. Greedy insertion goes on from there.
+    fn start(&mut self, near: f64) -> Vec<usize> {
         let n = self.t.len();
         let mut share = vec![0.0; n];
         for i in 1..n {
@@ -97,8 +110,8 @@ impl<const D: usize> Chooser<'_, D> {
         let mut spans = 1;
         loop {
             let kept = self.equal_shares(&share, spans);
-            let holds = self.worst(&kept, self.bound_m).is_some();
-            if holds || 2 * spans >= (MAX_POINTS / 2).min(n - 1) {
+            let close = self.worst(&kept, near * self.bound_m).is_some();
+            if close || 2 * spans >= (MAX_POINTS / 2).min(n - 1) {
                 return kept;
             }
             spans += spans.div_ceil(2);
