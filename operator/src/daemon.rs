@@ -164,7 +164,9 @@ impl Daemon {
             summary.sessions += 1;
             let _ = notices.send(Notice::Connected { epoch: link.epoch });
             let mut session = Session::new(self.config, self.skill.clone(), link.epoch);
-            let end = self.drive(&mut session, link, task, &mut quit, notices, &mut marks).await;
+            let end = self
+                .drive(&mut session, link, task, &mut quit, notices, &mut marks)
+                .await;
             summary.counters.add(session.counters());
             match end {
                 End::Finished | End::Quit => break,
@@ -204,15 +206,25 @@ impl Daemon {
             let why = match dialled {
                 Ok(Ok(link)) => return Ok(Some(link)),
                 // An operator that lost its link may find its own old session still in authority.
-                Ok(Err(DialError::Rejected { code: RejectCode::Busy, text })) if !first => text,
+                Ok(Err(DialError::Rejected {
+                    code: RejectCode::Busy,
+                    text,
+                })) if !first => text,
                 Ok(Err(DialError::Rejected { code, text })) => {
-                    return Err(DaemonError::Rejected { addr: self.robot, code, text });
+                    return Err(DaemonError::Rejected {
+                        addr: self.robot,
+                        code,
+                        text,
+                    });
                 }
                 Ok(Err(DialError::Again(why))) => why,
                 Err(_) => "no answer: is the robot running, and does UDP reach it?".to_owned(),
             };
             if first && self.now().secs_since(begun) > self.patience.as_secs_f64() {
-                return Err(DaemonError::Unreachable { addr: self.robot, why });
+                return Err(DaemonError::Unreachable {
+                    addr: self.robot,
+                    why,
+                });
             }
             if task.is_over(self.now()) {
                 return Ok(None);
@@ -224,16 +236,33 @@ impl Daemon {
 
     async fn connect(&self) -> Result<Link, DialError> {
         let again = |e: ControlError| DialError::Again(e.to_string());
-        let connecting =
-            self.endpoint.connect(self.robot, "telemime").map_err(|e| DialError::Again(e.to_string()))?;
-        let connection = connecting.await.map_err(|e| DialError::Again(quic::explain(&e)))?;
+        let connecting = self
+            .endpoint
+            .connect(self.robot, "telemime")
+            .map_err(|e| DialError::Again(e.to_string()))?;
+        let connection = connecting
+            .await
+            .map_err(|e| DialError::Again(quic::explain(&e)))?;
         let mut control = Control::open(&connection).await.map_err(again)?;
-        let hello = Hello { min: v1::VERSION, max: v1::VERSION, features: 0 };
+        let hello = Hello {
+            min: v1::VERSION,
+            max: v1::VERSION,
+            features: 0,
+        };
         control.write(&hello.encode()).await.map_err(again)?;
         match control.answer().await.map_err(again)? {
-            Answer::Ack { version: v1::VERSION, epoch, .. } => {
+            Answer::Ack {
+                version: v1::VERSION,
+                epoch,
+                ..
+            } => {
                 let (send, frames) = control.into_frames();
-                Ok(Link { connection, send, frames, epoch })
+                Ok(Link {
+                    connection,
+                    send,
+                    frames,
+                    epoch,
+                })
             }
             Answer::Ack { version, .. } => Err(DialError::Rejected {
                 code: RejectCode::Version,
@@ -259,10 +288,16 @@ impl Daemon {
             let now = self.now();
             while let Some(event) = session.poll_event() {
                 if matches!(event, Event::Ready) {
-                    let robot = session.info().map_or_else(String::new, |info| info.name.clone());
+                    let robot = session
+                        .info()
+                        .map_or_else(String::new, |info| info.name.clone());
                     let scale = session.scale().unwrap_or_default();
                     let path_bound_m = session.path_bound_m();
-                    let _ = notices.send(Notice::Mapping { scale, path_bound_m, robot });
+                    let _ = notices.send(Notice::Mapping {
+                        scale,
+                        path_bound_m,
+                        robot,
+                    });
                 }
                 match &event {
                     Event::Engaged { .. } => marks.engaged.get_or_insert(self.meter.counts()),
@@ -281,7 +316,10 @@ impl Daemon {
             if let Err(e) = self.flush(session, &mut link).await {
                 return End::Lost(e.to_string());
             }
-            let due = [session.poll_timeout().map(|(at, _)| at), task.poll_timeout()];
+            let due = [
+                session.poll_timeout().map(|(at, _)| at),
+                task.poll_timeout(),
+            ];
             let due = due.into_iter().flatten().min();
             tokio::select! {
                 biased;
@@ -352,7 +390,9 @@ struct Marks {
 
 impl Marks {
     fn span(&self, total: Counts) -> Counts {
-        let Some(from) = self.engaged else { return Counts::default() };
+        let Some(from) = self.engaged else {
+            return Counts::default();
+        };
         self.released.unwrap_or(total).since(from)
     }
 }

@@ -95,7 +95,9 @@ impl Task {
     /// When the recording's own time was 0 on the session clock, once known.
     pub fn zero(&self) -> Option<Stamp> {
         match &self.work {
-            Work::Replay { recording, .. } => self.started.map(|t| t.offset_by_secs(recording.rest_s)),
+            Work::Replay { recording, .. } => {
+                self.started.map(|t| t.offset_by_secs(recording.rest_s))
+            }
             Work::Play { .. } => self.engaged_at,
         }
     }
@@ -114,7 +116,8 @@ impl Task {
             || match &self.work {
                 Work::Replay { recording, .. } => {
                     let end_s = recording.samples.last().map_or(0.0, |s| s.0);
-                    self.zero().is_some_and(|zero| now.secs_since(zero) > end_s + LEAVE_S)
+                    self.zero()
+                        .is_some_and(|zero| now.secs_since(zero) > end_s + LEAVE_S)
                 }
                 Work::Play { .. } => self.trouble.is_some(),
             }
@@ -138,7 +141,9 @@ impl Task {
     /// The connection was lost: the arm holds, and nothing here engages it again.
     pub fn on_lost(&mut self, why: &str) {
         if matches!(self.phase, Phase::Asked | Phase::Engaged) {
-            self.give_up(format!("the link was lost ({why}); the arm holds and is not engaged again by itself"));
+            self.give_up(format!(
+                "the link was lost ({why}); the arm holds and is not engaged again by itself"
+            ));
         }
     }
 
@@ -155,7 +160,9 @@ impl Task {
             Event::Refused(Refusal::Diverged) => {}
             Event::Refused(reason) => self.give_up(format!("the robot declines: {reason:?}")),
             Event::State(RobotState::Holding, cause) => {
-                self.give_up(format!("the arm stopped by itself ({cause:?}) and holds; engage again on purpose"));
+                self.give_up(format!(
+                    "the arm stopped by itself ({cause:?}) and holds; engage again on purpose"
+                ));
             }
             Event::State(RobotState::Stopped, _) => self.give_up("emergency stop".into()),
             Event::State(RobotState::Ready, Cause::PlanFinished) => {
@@ -179,7 +186,8 @@ impl Task {
             return Advice::Continue;
         }
         let started = *self.started.get_or_insert(now);
-        let may_ask = self.trouble.is_none() && matches!(self.phase, Phase::Waiting(at) if at.is_none_or(|at| now >= at));
+        let may_ask = self.trouble.is_none()
+            && matches!(self.phase, Phase::Waiting(at) if at.is_none_or(|at| now >= at));
         match &mut self.work {
             Work::Play { plan } if may_ask => {
                 session.play(plan);
@@ -188,7 +196,8 @@ impl Task {
             Work::Play { .. } => {}
             Work::Replay { recording, next } => {
                 let mut fresh = false;
-                while let Some(sample) = sample_at(recording, *next, started).filter(|s| s.t <= now) {
+                while let Some(sample) = sample_at(recording, *next, started).filter(|s| s.t <= now)
+                {
                     session.handle_sample(now, sample);
                     fresh = true;
                     *next += 1;
@@ -212,15 +221,26 @@ impl Task {
 
     /// When [`Task::advise`] has something to do next.
     pub fn poll_timeout(&self) -> Option<Stamp> {
-        let retry = if let Phase::Waiting(at) = self.phase { at } else { None };
-        let leave = if let Phase::Leaving(at) = self.phase { Some(at) } else { None };
+        let retry = if let Phase::Waiting(at) = self.phase {
+            at
+        } else {
+            None
+        };
+        let leave = if let Phase::Leaving(at) = self.phase {
+            Some(at)
+        } else {
+            None
+        };
         let sample = match (&self.work, self.started) {
             (Work::Replay { recording, next }, Some(started)) => {
                 sample_at(recording, *next, started).map(|s| s.t)
             }
             _ => None,
         };
-        [retry.filter(|_| self.started.is_some()), leave, sample].into_iter().flatten().min()
+        [retry.filter(|_| self.started.is_some()), leave, sample]
+            .into_iter()
+            .flatten()
+            .min()
     }
 
     fn asked(&mut self) {
@@ -257,8 +277,14 @@ fn sample_at(recording: &Recording, i: usize, started: Stamp) -> Option<HandSamp
     let resting = rest_samples(recording);
     let first = recording.samples.first()?;
     if i < resting {
-        return Some(HandSample { t: started.offset_by_secs(i as f64 * REST_INTERVAL_S), x: first.1 });
+        return Some(HandSample {
+            t: started.offset_by_secs(i as f64 * REST_INTERVAL_S),
+            x: first.1,
+        });
     }
     let (t_s, x) = recording.samples.get(i - resting)?;
-    Some(HandSample { t: started.offset_by_secs(recording.rest_s + t_s - first.0), x: *x })
+    Some(HandSample {
+        t: started.offset_by_secs(recording.rest_s + t_s - first.0),
+        x: *x,
+    })
 }

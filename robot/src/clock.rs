@@ -56,23 +56,34 @@ impl SessionClock {
         if rtt_ns < 0 || t3 < t2 {
             return;
         }
-        let offset_ns = (t2.0.saturating_sub(t1.0) / 2).saturating_add(t3.0.saturating_sub(t4.0) / 2);
+        let offset_ns =
+            (t2.0.saturating_sub(t1.0) / 2).saturating_add(t3.0.saturating_sub(t4.0) / 2);
         if self.exchanges.len() == WINDOW {
             self.exchanges.pop_front();
         }
-        self.exchanges.push_back(Exchange { at: t4, rtt_s: rtt_ns as f64 * 1e-9, offset_ns });
+        self.exchanges.push_back(Exchange {
+            at: t4,
+            rtt_s: rtt_ns as f64 * 1e-9,
+            offset_ns,
+        });
     }
 
     /// Moves the applied offset towards the estimate; at once while `following` is false.
     pub fn slew(&mut self, now: Mono, following: bool) -> Slew {
-        let Some(best) = self.best(now) else { return Slew::Smooth };
+        let Some(best) = self.best(now) else {
+            return Slew::Smooth;
+        };
         let target_ns = best.offset_ns as f64;
         match self.applied {
             Some((since, applied_ns)) if following => {
                 let error_ns = target_ns - applied_ns;
                 let most_ns = SLEW * now.secs_since(since).max(0.0) * 1e9;
                 self.applied = Some((now, applied_ns + error_ns.clamp(-most_ns, most_ns)));
-                if error_ns.abs() > STEP_S * 1e9 { Slew::Step } else { Slew::Smooth }
+                if error_ns.abs() > STEP_S * 1e9 {
+                    Slew::Step
+                } else {
+                    Slew::Smooth
+                }
             }
             _ => {
                 self.applied = Some((now, target_ns));
@@ -88,12 +99,14 @@ impl SessionClock {
 
     /// When `stamp` was, or will be, on the robot's clock.
     pub fn to_mono(&self, stamp: Stamp) -> Option<Mono> {
-        self.applied.map(|(_, offset_ns)| Mono(stamp.0.saturating_sub(offset_ns.round() as i64)))
+        self.applied
+            .map(|(_, offset_ns)| Mono(stamp.0.saturating_sub(offset_ns.round() as i64)))
     }
 
     /// What the session clock shows at `mono`.
     pub fn to_session(&self, mono: Mono) -> Option<Stamp> {
-        self.applied.map(|(_, offset_ns)| Stamp(mono.0.saturating_add(offset_ns.round() as i64)))
+        self.applied
+            .map(|(_, offset_ns)| Stamp(mono.0.saturating_add(offset_ns.round() as i64)))
     }
 
     /// Bound of the offset's error, s: half the best round trip, and the drift since.
@@ -110,7 +123,9 @@ impl SessionClock {
         if self.exchanges.len() < ENOUGH {
             return None;
         }
-        self.exchanges.iter().min_by(|a, b| badness_s(a, now).total_cmp(&badness_s(b, now)))
+        self.exchanges
+            .iter()
+            .min_by(|a, b| badness_s(a, now).total_cmp(&badness_s(b, now)))
     }
 }
 
@@ -128,7 +143,12 @@ mod tests {
 
     fn exchange(clock: &mut SessionClock, at: i64, offset: i64, up: i64, down: i64) {
         let (t1, t2) = (at, at + up + offset);
-        clock.observe(Mono(t1), Stamp(t2), Stamp(t2 + MS), Mono(at + up + MS + down));
+        clock.observe(
+            Mono(t1),
+            Stamp(t2),
+            Stamp(t2 + MS),
+            Mono(at + up + MS + down),
+        );
     }
 
     #[test]
@@ -145,7 +165,10 @@ mod tests {
         let error_s = clock.to_session(now).unwrap().0 - (now.0 + offset);
         assert!(error_s.abs() < 6 * MS, "{error_s} ns");
         let bound_s = clock.uncertainty_s(now).unwrap();
-        assert!((error_s as f64 * 1e-9).abs() < bound_s && bound_s < 0.101, "{bound_s}");
+        assert!(
+            (error_s as f64 * 1e-9).abs() < bound_s && bound_s < 0.101,
+            "{bound_s}"
+        );
     }
 
     #[test]
@@ -157,7 +180,10 @@ mod tests {
         let now = Mono(8 * 250 * MS);
         clock.slew(now, false);
         let error_s = (clock.to_session(now).unwrap().0 - now.0) as f64 * 1e-9;
-        assert!((error_s - 0.04).abs() < 1e-6, "half the asymmetry: {error_s}");
+        assert!(
+            (error_s - 0.04).abs() < 1e-6,
+            "half the asymmetry: {error_s}"
+        );
         assert!(error_s < clock.uncertainty_s(now).unwrap());
     }
 
@@ -177,6 +203,10 @@ mod tests {
         exchange(&mut clock, 70 * MS, 500 * MS, 0, 0);
         assert_eq!(clock.slew(Mono(1051 * MS), true), Slew::Step);
         clock.observe(Mono(100), Stamp(0), Stamp(500), Mono(200));
-        assert_eq!(clock.exchanges.len(), 6, "a negative round trip is no exchange");
+        assert_eq!(
+            clock.exchanges.len(),
+            6,
+            "a negative round trip is no exchange"
+        );
     }
 }

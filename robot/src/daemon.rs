@@ -103,7 +103,9 @@ impl Daemon {
             if let Some(why) = ended {
                 self.end(&mut active, &mut skill, &why, &notices);
             }
-            let due = active.as_ref().map(|a| self.clock.instant(a.session.poll_timeout().0));
+            let due = active
+                .as_ref()
+                .map(|a| self.clock.instant(a.session.poll_timeout().0));
             tokio::select! {
                 biased;
                 _ = quit.wait_for(|quit| *quit) => break,
@@ -143,12 +145,17 @@ impl Daemon {
             let _ = tokio::time::timeout(Duration::from_millis(500), active.send.stopped()).await;
         }
         self.end(&mut active, &mut skill, "the robot daemon stops", &notices);
-        self.endpoint.close(VarInt::from_u32(0), b"the robot daemon stops");
+        self.endpoint
+            .close(VarInt::from_u32(0), b"the robot daemon stops");
         self.endpoint.wait_idle().await;
     }
 
     async fn clock_tick(&self) {
-        sleep_until(self.clock.instant(self.clock.now().offset_by_secs(2.0 * DRAIN.as_secs_f64()))).await;
+        sleep_until(
+            self.clock
+                .instant(self.clock.now().offset_by_secs(2.0 * DRAIN.as_secs_f64())),
+        )
+        .await;
     }
 
     /// Gives authority, or says why not.
@@ -160,15 +167,25 @@ impl Daemon {
         epoch: &mut u32,
         notices: &mpsc::UnboundedSender<Notice>,
     ) -> Option<String> {
-        let Greeted { connection, mut control, hello } = greeted;
+        let Greeted {
+            connection,
+            mut control,
+            hello,
+        } = greeted;
         let refusal = match negotiate(&hello, v1::VERSION, v1::VERSION) {
             None => Some((
                 RejectCode::Version,
-                format!("this robot speaks version {}, you offer {} to {}", v1::VERSION, hello.min, hello.max),
+                format!(
+                    "this robot speaks version {}, you offer {} to {}",
+                    v1::VERSION,
+                    hello.min,
+                    hello.max
+                ),
             )),
-            Some(_) if active.is_some() => {
-                Some((RejectCode::Busy, "another operator has authority".to_owned()))
-            }
+            Some(_) if active.is_some() => Some((
+                RejectCode::Busy,
+                "another operator has authority".to_owned(),
+            )),
             Some(_) => None,
         };
         let peer = connection.remote_address();
@@ -184,15 +201,32 @@ impl Daemon {
             return Some(why);
         }
         *epoch += 1;
-        let ack = Answer::Ack { version: v1::VERSION, features: 0, epoch: *epoch };
+        let ack = Answer::Ack {
+            version: v1::VERSION,
+            features: 0,
+            epoch: *epoch,
+        };
         if let Err(e) = control.write(&ack.encode()).await {
             return Some(format!("{peer}: {e}"));
         }
         let (send, frames) = control.into_frames();
-        let session =
-            Session::new(self.config, self.info.clone(), *epoch, skill.clone(), self.clock.now());
-        *active = Some(Active { session, connection, send, frames });
-        let _ = notices.send(Notice::Connected { epoch: *epoch, peer });
+        let session = Session::new(
+            self.config,
+            self.info.clone(),
+            *epoch,
+            skill.clone(),
+            self.clock.now(),
+        );
+        *active = Some(Active {
+            session,
+            connection,
+            send,
+            frames,
+        });
+        let _ = notices.send(Notice::Connected {
+            epoch: *epoch,
+            peer,
+        });
         None
     }
 
@@ -206,6 +240,14 @@ impl Daemon {
             let (_, mean_ns, p99_ns, overruns) = timing.read();
             TickTiming { mean_ns, p99_ns, overruns }
         });
+        let timing = self
+            .timing
+            .as_deref()
+            .map_or_else(TickTiming::default, |t| TickTiming {
+                mean_ns: t.mean_ns.load(Ordering::Relaxed),
+                p99_ns: t.p99_ns.load(Ordering::Relaxed),
+                overruns: t.overruns.load(Ordering::Relaxed),
+            });
         while let Ok(report) = self.servo.reports.pop() {
             if let Some(active) = active.as_deref_mut() {
                 active.session.handle_report(&report, timing);
@@ -241,7 +283,9 @@ impl Daemon {
         why: &str,
         notices: &mpsc::UnboundedSender<Notice>,
     ) {
-        let Some(mut ended) = active.take() else { return };
+        let Some(mut ended) = active.take() else {
+            return;
+        };
         ended.session.handle_closed();
         while let Some(output) = ended.session.poll_output() {
             if let Output::Order(order) = output {
@@ -265,13 +309,19 @@ impl Daemon {
             .zip(clock.uncertainty_s(now))
             .map(|(t, bound_s)| ((t.0 - now.0) as f64 * 1e-9, bound_s));
         let counters = ended.session.counters();
-        let _ = notices.send(Notice::Disconnected { why: why.to_owned(), clock, counters });
+        let _ = notices.send(Notice::Disconnected {
+            why: why.to_owned(),
+            clock,
+            counters,
+        });
     }
 }
 
 /// The next thing the operator sends; a reason if it is the last. Never resolves without an operator.
 async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<String> {
-    let Some(active) = active else { return std::future::pending().await };
+    let Some(active) = active else {
+        return std::future::pending().await;
+    };
     tokio::select! {
         biased;
         frame = active.frames.recv() => match frame {
@@ -292,10 +342,16 @@ async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<Strin
 }
 
 /// Handshake and greeting, beside the running session.
-async fn greet(incoming: Incoming, greeted: mpsc::Sender<Greeted>, notices: mpsc::UnboundedSender<Notice>) {
+async fn greet(
+    incoming: Incoming,
+    greeted: mpsc::Sender<Greeted>,
+    notices: mpsc::UnboundedSender<Notice>,
+) {
     let peer = incoming.remote_address();
     let refused = |why: String| {
-        let _ = notices.send(Notice::Refused { why: format!("{peer}: {why}") });
+        let _ = notices.send(Notice::Refused {
+            why: format!("{peer}: {why}"),
+        });
     };
     let connection = match incoming.await {
         Ok(connection) => connection,
@@ -308,14 +364,27 @@ async fn greet(incoming: Incoming, greeted: mpsc::Sender<Greeted>, notices: mpsc
     match control.hello().await {
         Ok(hello) => {
             // The daemon has stopped if nobody receives.
-            let _ = greeted.send(Greeted { connection, control, hello }).await;
+            let _ = greeted
+                .send(Greeted {
+                    connection,
+                    control,
+                    hello,
+                })
+                .await;
         }
         Err(e) => {
             let text = e.to_string();
-            let _ = control.write(&Answer::Reject { code: RejectCode::Malformed, text: text.clone() }.encode()).await;
+            let _ = control
+                .write(
+                    &Answer::Reject {
+                        code: RejectCode::Malformed,
+                        text: text.clone(),
+                    }
+                    .encode(),
+                )
+                .await;
             connection.close(VarInt::from_u32(3), b"malformed greeting");
             refused(text);
         }
     }
 }
-

@@ -88,18 +88,23 @@ impl Rig {
         let (urdf, text) = match &options.urdf {
             None => ("the built-in arm".to_owned(), default_urdf().to_owned()),
             Some(path) => {
-                let text = std::fs::read_to_string(path)
-                    .map_err(|source| RigError::Io { path: path.clone(), source })?;
+                let text = std::fs::read_to_string(path).map_err(|source| RigError::Io {
+                    path: path.clone(),
+                    source,
+                })?;
                 (path.display().to_string(), text)
             }
         };
-        let arm = ArmModel::from_urdf(&text, &options.load)
-            .map_err(|source| RigError::Arm { urdf: urdf.clone(), source })?;
+        let arm = ArmModel::from_urdf(&text, &options.load).map_err(|source| RigError::Arm {
+            urdf: urdf.clone(),
+            source,
+        })?;
         let home = match &options.start {
             None => home_posture(&arm),
-            Some(q) => arm
-                .posture(q)
-                .ok_or_else(|| RigError::Start { given: q.len(), dof: arm.dof() })?,
+            Some(q) => arm.posture(q).ok_or_else(|| RigError::Start {
+                given: q.len(),
+                dof: arm.dof(),
+            })?,
         };
         let arm = Arc::new(arm);
         let controller = Controller::new(arm.clone(), &options.control, &home)
@@ -111,7 +116,14 @@ impl Rig {
             lag_s: controller.lag_s(),
             radius_m,
         };
-        Ok(Self { plant: Plant::new(arm.clone(), &home)?, arm, home, radius_m, controller, config })
+        Ok(Self {
+            plant: Plant::new(arm.clone(), &home)?,
+            arm,
+            home,
+            radius_m,
+            controller,
+            config,
+        })
     }
 
     /// What the operator is told.
@@ -150,6 +162,11 @@ impl Rig {
 
     /// A servo at rest at the start posture.
     pub fn servo(&self, rings: Rings) -> Core {
-        Core::new(self.config, self.controller.clone(), self.plant.clone(), rings)
+        Core::new(
+            self.config,
+            self.controller.clone(),
+            self.plant.clone(),
+            rings,
+        )
     }
 }

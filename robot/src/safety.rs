@@ -15,7 +15,10 @@ pub struct SafetyConfig {
 
 impl Default for SafetyConfig {
     fn default() -> Self {
-        Self { coast_after_s: 0.26, max_lease_s: 1.0 }
+        Self {
+            coast_after_s: 0.26,
+            max_lease_s: 1.0,
+        }
     }
 }
 
@@ -122,7 +125,11 @@ impl Safety {
     /// Leaves the latched stop, on purpose.
     pub fn reset(&mut self, operator_present: bool) {
         if self.state == RobotState::Stopped {
-            let next = if operator_present { RobotState::Ready } else { RobotState::Idle };
+            let next = if operator_present {
+                RobotState::Ready
+            } else {
+                RobotState::Idle
+            };
             self.enter(next, Cause::Requested);
         }
     }
@@ -185,13 +192,23 @@ mod tests {
         safety.tick(Mono(259 * MS));
         assert_eq!(safety.state(), RobotState::Engaged);
         safety.tick(Mono(260 * MS));
-        assert_eq!((safety.state(), safety.speed_scale(Mono(260 * MS))), (RobotState::Coasting, 1.0));
+        assert_eq!(
+            (safety.state(), safety.speed_scale(Mono(260 * MS))),
+            (RobotState::Coasting, 1.0)
+        );
         assert!((safety.speed_scale(Mono(355 * MS)) - 0.5).abs() < 1e-9);
         safety.tick(Mono(450 * MS));
-        assert_eq!((safety.state(), safety.cause()), (RobotState::Holding, Cause::LeaseExpired));
+        assert_eq!(
+            (safety.state(), safety.cause()),
+            (RobotState::Holding, Cause::LeaseExpired)
+        );
         safety.news(Mono(451 * MS), 0.45);
         safety.tick(Mono(451 * MS));
-        assert_eq!(safety.state(), RobotState::Holding, "never re-engages by itself");
+        assert_eq!(
+            safety.state(),
+            RobotState::Holding,
+            "never re-engages by itself"
+        );
         assert!(safety.engage(Mono(500 * MS), 0.45));
     }
 
@@ -201,7 +218,10 @@ mod tests {
         safety.tick(Mono(300 * MS));
         assert_eq!(safety.state(), RobotState::Coasting);
         safety.news(Mono(301 * MS), 0.45);
-        assert_eq!((safety.state(), safety.speed_scale(Mono(302 * MS))), (RobotState::Engaged, 1.0));
+        assert_eq!(
+            (safety.state(), safety.speed_scale(Mono(302 * MS))),
+            (RobotState::Engaged, 1.0)
+        );
     }
 
     #[test]
@@ -223,7 +243,10 @@ mod tests {
     fn a_lost_connection_holds_and_a_new_operator_does_not_move_the_arm() {
         let mut safety = engaged();
         safety.set_operator(false);
-        assert_eq!((safety.state(), safety.cause()), (RobotState::Holding, Cause::ConnectionLost));
+        assert_eq!(
+            (safety.state(), safety.cause()),
+            (RobotState::Holding, Cause::ConnectionLost)
+        );
         safety.set_operator(true);
         assert!(!safety.is_following());
     }

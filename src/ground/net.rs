@@ -52,12 +52,17 @@ impl Network {
     /// A socket at `addr`.
     pub fn socket(&self, addr: SocketAddr) -> Arc<Socket> {
         self.state().inboxes.insert(addr, Inbox::default());
-        Arc::new(Socket { network: self.clone(), addr })
+        Arc::new(Socket {
+            network: self.clone(),
+            addr,
+        })
     }
 
     /// Sets the link from `from` to `to`.
     pub fn link(&self, from: SocketAddr, to: SocketAddr, config: LinkConfig, seed: u64) {
-        self.state().links.insert((from, to), Link::new(config, seed));
+        self.state()
+            .links
+            .insert((from, to), Link::new(config, seed));
     }
 
     /// Cuts every link, or restores them. Packets already on their way arrive.
@@ -66,7 +71,9 @@ impl Network {
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
-        self.0.lock().expect("no code panics while it holds the network")
+        self.0
+            .lock()
+            .expect("no code panics while it holds the network")
     }
 
     fn send(&self, from: SocketAddr, to: SocketAddr, packet: &[u8]) {
@@ -77,7 +84,9 @@ impl Network {
             Some(link) => link.send(now_ns, len),
             None => Fate::Deliver { at_ns: now_ns },
         };
-        let Fate::Deliver { at_ns } = fate else { return };
+        let Fate::Deliver { at_ns } = fate else {
+            return;
+        };
         if state.down {
             return;
         }
@@ -92,7 +101,9 @@ impl Network {
 
     fn deliver(&self, from: SocketAddr, to: SocketAddr, packet: Vec<u8>) {
         let mut state = self.state();
-        let Some(inbox) = state.inboxes.get_mut(&to) else { return };
+        let Some(inbox) = state.inboxes.get_mut(&to) else {
+            return;
+        };
         inbox.packets.push_back((from, packet));
         if let Some(waker) = inbox.waker.take() {
             waker.wake();
@@ -127,7 +138,10 @@ impl AsyncUdpSocket for Socket {
     }
 
     fn try_send(&self, transmit: &Transmit<'_>) -> io::Result<()> {
-        let segment = transmit.segment_size.unwrap_or(transmit.contents.len()).max(1);
+        let segment = transmit
+            .segment_size
+            .unwrap_or(transmit.contents.len())
+            .max(1);
         for packet in transmit.contents.chunks(segment) {
             self.network.send(self.addr, transmit.destination, packet);
         }
@@ -150,7 +164,13 @@ impl AsyncUdpSocket for Socket {
         {
             let len = packet.len().min(bufs[received].len());
             bufs[received][..len].copy_from_slice(&packet[..len]);
-            meta[received] = RecvMeta { addr: from, len, stride: len, ecn: None, dst_ip: None };
+            meta[received] = RecvMeta {
+                addr: from,
+                len,
+                stride: len,
+                ecn: None,
+                dst_ip: None,
+            };
             received += 1;
         }
         if received > 0 {

@@ -10,7 +10,9 @@ use std::time::Duration;
 use telemime_endpoint::cli::Word;
 use telemime_endpoint::quic::EndpointError;
 use telemime_endpoint::{HostClock, Identity, IdentityError, Meter, Mono, quic};
-use telemime_operator::daemon::{Daemon as OperatorDaemon, DaemonError, Notice as OperatorNotice, Summary};
+use telemime_operator::daemon::{
+    Daemon as OperatorDaemon, DaemonError, Notice as OperatorNotice, Summary,
+};
 use telemime_operator::session::SessionConfig;
 use telemime_operator::task::Task;
 use telemime_protocol::skill::Skill;
@@ -49,7 +51,10 @@ fn host(n: u8) -> SocketAddr {
 /// # Errors
 /// [`PairError::Runtime`] if there is no runtime to be had.
 pub fn run_virtual<T>(scenario: impl Future<Output = T>) -> Result<T, PairError> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build()?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_time()
+        .start_paused(true)
+        .build()?;
     Ok(tokio::task::LocalSet::new().block_on(&runtime, scenario))
 }
 
@@ -134,7 +139,10 @@ impl Pair {
                 core.tick(clock.now());
             }
         });
-        let socket = quic::Socket::Abstract { socket: network.socket(host(1)), seed: [1; 32] };
+        let socket = quic::Socket::Abstract {
+            socket: network.socket(host(1)),
+            seed: [1; 32],
+        };
         let endpoint = quic::server(
             &robot_identity,
             vec![operator_identity.fingerprint()],
@@ -154,6 +162,12 @@ impl Pair {
         let (words, words_rx) = mpsc::unbounded_channel();
         tokio::task::spawn_local(daemon.run(quit_rx, words_rx, tx));
         let robot = Robot { reports: Rc::default(), notices: Rc::default(), quit, words };
+        tokio::task::spawn_local(daemon.run(quit_rx, tx));
+        let robot = Robot {
+            reports: Rc::default(),
+            notices: Rc::default(),
+            quit,
+        };
         let log = robot.clone();
         tokio::task::spawn_local(async move {
             while let Some(notice) = rx.recv().await {
@@ -163,7 +177,14 @@ impl Pair {
                 }
             }
         });
-        Ok(Self { network, robot, clock, robot_identity, operator_identity, operators: 0 })
+        Ok(Self {
+            network,
+            robot,
+            clock,
+            robot_identity,
+            operator_identity,
+            operators: 0,
+        })
     }
 
     /// Now on the common clock.
@@ -221,10 +242,13 @@ impl Pair {
         self.operators += 1;
         let own = host(1 + self.operators);
         self.network.link(own, host(1), link.clone(), seed);
-        self.network.link(host(1), own, link.clone(), seed ^ 0x9e37_79b9_7f4a_7c15);
+        self.network
+            .link(host(1), own, link.clone(), seed ^ 0x9e37_79b9_7f4a_7c15);
         let meter = Meter::default();
-        let socket =
-            quic::Socket::Abstract { socket: self.network.socket(own), seed: [self.operators + 1; 32] };
+        let socket = quic::Socket::Abstract {
+            socket: self.network.socket(own),
+            seed: [self.operators + 1; 32],
+        };
         let endpoint = quic::client(identity, self.robot_identity.fingerprint(), socket, &meter)?;
         let daemon = OperatorDaemon {
             endpoint,
@@ -243,7 +267,11 @@ impl Pair {
             let result = daemon.run(&mut task, quit_rx, &tx).await;
             (result, task)
         });
-        Ok(Operator { done, notices, quit })
+        Ok(Operator {
+            done,
+            notices,
+            quit,
+        })
     }
 
     fn operator_identity_copy(&self) -> Result<Identity, IdentityError> {

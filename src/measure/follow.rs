@@ -27,7 +27,10 @@ pub fn follow(
 ) -> Follow {
     let (mut controller, mut plant) = rig.parts();
     let tick_s = rig.tick_s();
-    let mapping = Mapping { tip_m: controller.reset_reference(plant.q()), ..*mapping };
+    let mapping = Mapping {
+        tip_m: controller.reset_reference(plant.q()),
+        ..*mapping
+    };
     let mut points = Vec::new();
     let mut clamps = 0;
     let ticks = ((to_s - from_s) / tick_s).ceil().max(1.0) as u64;
@@ -36,9 +39,18 @@ pub fn follow(
         let hand_m = demanded(from_s + since_s).unwrap_or(mapping.hand_m);
         let (placed, out_of_reach) = mapping.place(hand_m, rig.radius_m);
         let target = mapping.tip_m + (placed - mapping.tip_m) * ramp(since_s / RAMP_S);
-        let output = controller.tick(Demand::Follow { target, speed_scale: 1.0 }, plant.q(), plant.qd());
+        let output = controller.tick(
+            Demand::Follow {
+                target,
+                speed_scale: 1.0,
+            },
+            plant.q(),
+            plant.qd(),
+        );
         let strain = plant.step(&output.tau, tick_s);
-        clamps += u32::from(out_of_reach || output.clamps != Default::default() || strain != Default::default());
+        clamps += u32::from(
+            out_of_reach || output.clamps != Default::default() || strain != Default::default(),
+        );
         points.push((from_s + since_s, mapping.unplace(output.tip)));
     }
     let tip = Track::new(points).expect("ticks are in order, and the arm stays finite");

@@ -52,7 +52,9 @@ impl Track {
     /// The position at `t_s`, m.
     pub fn at(&self, t_s: f64) -> Vector3<f64> {
         let after = self.0.partition_point(|p| p.0 <= t_s);
-        let Some((t0, x0)) = after.checked_sub(1).map(|i| self.0[i]) else { return self.0[0].1 };
+        let Some((t0, x0)) = after.checked_sub(1).map(|i| self.0[i]) else {
+            return self.0[0].1;
+        };
         match self.0.get(after) {
             Some((t1, x1)) if *t1 > t0 => x0.lerp(x1, (t_s - t0) / (t1 - t0)),
             _ => x0,
@@ -64,7 +66,10 @@ impl Track {
     pub fn lag_behind(&self, truth: &Self, grid_s: &[f64]) -> (f64, f64) {
         let own: Vec<_> = grid_s.iter().map(|&t| self.at(t)).collect();
         let error = |shift_s: f64| -> f64 {
-            own.iter().zip(grid_s).map(|(x, t)| (x - truth.at(t - shift_s)).norm_squared()).sum()
+            own.iter()
+                .zip(grid_s)
+                .map(|(x, t)| (x - truth.at(t - shift_s)).norm_squared())
+                .sum()
         };
         let best = LAG_RANGE_MS
             .map(|ms| (f64::from(ms) * 1e-3, error(f64::from(ms) * 1e-3)))
@@ -76,7 +81,10 @@ impl Track {
 
 /// Root mean square distance of two tracks over the times `grid_s`, m.
 pub fn rmse_m(a: &Track, b: &Track, grid_s: &[f64]) -> f64 {
-    let sum: f64 = grid_s.iter().map(|&t| (a.at(t) - b.at(t)).norm_squared()).sum();
+    let sum: f64 = grid_s
+        .iter()
+        .map(|&t| (a.at(t) - b.at(t)).norm_squared())
+        .sum();
     (sum / grid_s.len().max(1) as f64).sqrt()
 }
 
@@ -105,9 +113,19 @@ mod tests {
     #[test]
     fn a_delayed_track_lags_by_its_delay() {
         let grid: Vec<_> = (100..400).map(|i| f64::from(i) * 0.01).collect();
-        let sine_only = |t: Track| Track::new(t.0.into_iter().map(|(t, x)| (t, x.xy().push(0.0))).collect()).unwrap();
+        let sine_only = |t: Track| {
+            Track::new(
+                t.0.into_iter()
+                    .map(|(t, x)| (t, x.xy().push(0.0)))
+                    .collect(),
+            )
+            .unwrap()
+        };
         let (lag_s, rest_m) = sine_only(sine(0.123)).lag_behind(&sine_only(sine(0.0)), &grid);
-        assert!((lag_s - 0.123).abs() < 1e-9 && rest_m < 1e-3, "{lag_s} {rest_m}");
+        assert!(
+            (lag_s - 0.123).abs() < 1e-9 && rest_m < 1e-3,
+            "{lag_s} {rest_m}"
+        );
     }
 
     #[test]
@@ -116,6 +134,10 @@ mod tests {
         let arrivals = [(0.2, 0.0, x(0.0)), (0.3, 0.2, x(2.0)), (0.31, 0.1, x(1.0))];
         assert_eq!(sample_and_hold(&arrivals, 0.1), None);
         assert_eq!(sample_and_hold(&arrivals, 0.25), Some(x(0.0)));
-        assert_eq!(sample_and_hold(&arrivals, 0.4), Some(x(2.0)), "a late one is overtaken");
+        assert_eq!(
+            sample_and_hold(&arrivals, 0.4),
+            Some(x(2.0)),
+            "a late one is overtaken"
+        );
     }
 }

@@ -53,9 +53,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let mut text = report.text();
     if args.series.is_none() {
         text.push_str(
-            "The publication's learning block is a variational mixture, which Telemime does not have \
-             yet: \"its method\" learns\nby plain EM with its K = 3 here, so tables I and III differ from \
-             the printed ones there. --series takes its own inferred motion.\n",
+            "The publication's learning block is a variational mixture, which Telemime does not have yet: \
+             \"its method\" learns\nby plain EM with its K = 3 here, a different motion, of which the same rule \
+             keeps different samples. With\n--series DIR its own inferred motion goes in, and its printed \
+             R² come out.\n",
         );
     }
     text.push_str(

@@ -64,7 +64,7 @@ fn its_series_give_its_tables_to_three_decimals() {
     // Ours: fewer points and a bound in time, and better than as many at even distances.
     let ours = &task["ours"];
     assert!(ours["checkpoints"].as_u64() < Some(14));
-    assert!(r2(&ours["encoder"])[1] > 0.9999);
+    assert!(r2(&ours["encoder"])[1] > 0.9995);
     let uniform = &task["baselines"]["uniform_in_time"];
     assert_eq!(uniform["checkpoints"], ours["checkpoints"]);
     assert!(r2(&uniform["encoder"])[1] < r2(&ours["encoder"])[1]);
@@ -92,7 +92,7 @@ fn from_the_formulas_with_a_figure() {
                 }
             }
         }
-        assert!(r2(&task["ours"]["encoder"]).iter().all(|r2| *r2 > 0.9999));
+        assert!(r2(&task["ours"]["encoder"]).iter().all(|r2| *r2 > 0.9995));
     }
     // Plain EM on task 1: 0.9906 with three components, 0.9971 with the seven that BIC chooses.
     assert!((r2(&tasks[0]["reproduced"]["learning"])[1] - 0.9906).abs() < 1e-4);

@@ -46,8 +46,16 @@ pub(super) struct Adaptation {
     square: f64,
 }
 
-const UNDAMPED: Params = Params { gain: 1.0, trust: 0.0, cv_damping: 1.0 };
-const MIXTURE: Params = Params { gain: 1.0, trust: 1.0, cv_damping: 0.0 };
+const UNDAMPED: Params = Params {
+    gain: 1.0,
+    trust: 0.0,
+    cv_damping: 1.0,
+};
+const MIXTURE: Params = Params {
+    gain: 1.0,
+    trust: 1.0,
+    cv_damping: 0.0,
+};
 
 impl Adaptation {
     /// Starts from what was calibrated with the skill, or from the defaults.
@@ -90,6 +98,23 @@ impl Adaptation {
     fn moving(&self, hand: &HandState) -> f64 {
         let moved = hand.memory.iter().map(|m| (hand.x - m).norm_squared()).fold(0.0, f64::max);
         moved / (moved + self.rest_m * self.rest_m)
+    /// Trust: weights ∝ (mean squared error)⁻² (prediction.md §3). Damping: the least-squares factor on
+    /// the velocity, drawn to ½ where nothing has moved yet.
+    pub(super) fn params(&self) -> Params {
+        let defaults = Params::default();
+        let Some(prior) = self.prior else {
+            return Params {
+                gain: self.gain,
+                ..defaults
+            };
+        };
+        let straight = (self.straight_error + PRIOR_RATIO * prior).powi(2);
+        let cv_damping = (self.along + 0.5 * prior) / (self.square + prior);
+        Params {
+            gain: self.gain,
+            trust: straight / (straight + mixture),
+            cv_damping: cv_damping.clamp(0.0, 1.0),
+        }
     }
 
     /// Judges what was predicted for the time up to `newest`, and predicts `horizon_s` ahead of it.
@@ -102,13 +127,17 @@ impl Adaptation {
     ) {
         let span_s = newest.t.secs_since(previous.t);
         while self.pending.front().is_some_and(|p| p.due <= newest.t) {
-            let Some(pending) = self.pending.pop_front() else { break };
+            let Some(pending) = self.pending.pop_front() else {
+                break;
+            };
             let u = (pending.due.secs_since(previous.t) / span_s).clamp(0.0, 1.0);
             self.judge(&pending, previous.x.lerp(&newest.x, u));
         }
         let horizon_s = horizon_s.clamp(*HORIZON_S.start(), *HORIZON_S.end());
         let mixture = model.map(|model| model.forecast(newest, &MIXTURE).at(horizon_s));
-        let straight = Forecast::constant_velocity(newest, &UNDAMPED).at(horizon_s).position;
+        let straight = Forecast::constant_velocity(newest, &UNDAMPED)
+            .at(horizon_s)
+            .position;
         if self.prior.is_none() {
             self.prior = mixture.map(|p| PRIOR * (3.0 * p.sigma_m * p.sigma_m).max(1e-8));
         }

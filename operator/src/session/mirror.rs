@@ -11,8 +11,8 @@ use telemime_protocol::wire::knots;
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::v1::{Motion, WireParams, model_tag};
 
-use super::adapt::Adaptation;
 use super::FutureBound;
+use super::adapt::Adaptation;
 
 /// Knots in one message; the oldest unacknowledged first.
 const KNOTS_PER_MESSAGE: usize = 24;
@@ -65,6 +65,11 @@ impl Mirror {
     pub(super) fn reference(&self, skill: Option<&Skill>) -> Option<(WireState, u16, WireParams)> {
         let state = WireState::quantise(&self.hand)?;
         Some((state, self.model(skill), WireParams::quantise(&self.adaptation.params(&self.hand))))
+        Some((
+            state,
+            self.model(skill),
+            WireParams::quantise(&self.adaptation.params()),
+        ))
     }
 
     pub(super) fn go_without_model(&mut self) {
@@ -90,10 +95,13 @@ impl Mirror {
     ) -> bool {
         self.hand = hand;
         let skill = skill.filter(|_| !self.without_model);
-        self.adaptation.observe(previous, &hand, skill.map(Skill::predictor), horizon_s);
+        self.adaptation
+            .observe(previous, &hand, skill.map(Skill::predictor), horizon_s);
         self.newest = self.predict(skill);
         // A sample the path cannot hold (out of the grid's range) is still good for the future.
-        let Ok(Some(knot)) = self.path.push(hand.t, hand.x) else { return false };
+        let Ok(Some(knot)) = self.path.push(hand.t, hand.x) else {
+            return false;
+        };
         if self.unacknowledged.len() == MAX_UNACKNOWLEDGED {
             self.unacknowledged.pop_front();
             self.first_unacknowledged += 1;
@@ -104,8 +112,13 @@ impl Mirror {
 
     /// Whether the robot's prediction for `arrival` would differ by more than the bound.
     pub(super) fn future_changed(&self, arrival: Stamp, bound: FutureBound) -> bool {
-        let (Some(sent), Some(newest)) = (&self.sent, &self.newest) else { return true };
-        let (held, known) = (sent.at(arrival.secs_since(sent.t)), newest.at(arrival.secs_since(newest.t)));
+        let (Some(sent), Some(newest)) = (&self.sent, &self.newest) else {
+            return true;
+        };
+        let (held, known) = (
+            sent.at(arrival.secs_since(sent.t)),
+            newest.at(arrival.secs_since(newest.t)),
+        );
         let bound_m = match bound {
             FutureBound::Absolute(bound_m) => bound_m,
             FutureBound::Relative(factor) => factor * known.sigma_m,
@@ -120,7 +133,12 @@ impl Mirror {
         self.messages += 1;
         let forecast = self.predict(skill)?;
         self.sent = Some(forecast);
-        let due: Vec<_> = self.unacknowledged.iter().take(KNOTS_PER_MESSAGE).copied().collect();
+        let due: Vec<_> = self
+            .unacknowledged
+            .iter()
+            .take(KNOTS_PER_MESSAGE)
+            .copied()
+            .collect();
         Some(Motion {
             epoch: 0,
             engagement: 0,
@@ -136,7 +154,9 @@ impl Mirror {
     }
 
     fn model(&self, skill: Option<&Skill>) -> u16 {
-        skill.filter(|_| !self.without_model).map_or(0, |skill| model_tag(&skill.id().0))
+        skill
+            .filter(|_| !self.without_model)
+            .map_or(0, |skill| model_tag(&skill.id().0))
     }
 
     /// What the robot would predict if it were sent the newest state now: from the numbers as they travel.

@@ -226,13 +226,19 @@ impl Session {
     /// Tip metres per hand metre of the next engagement; `None` before the robot has introduced itself.
     pub fn scale(&self) -> Option<f64> {
         let info = self.info.as_ref()?;
-        let derived = self.skill.as_ref().map_or(0.1, |skill| default_scale(skill.stats(), info));
+        let derived = self
+            .skill
+            .as_ref()
+            .map_or(0.1, |skill| default_scale(skill.stats(), info));
         Some(self.config.scale.unwrap_or(derived))
     }
 
     /// ε_path of the next engagement, m.
     pub fn path_bound_m(&self) -> f64 {
-        let derived = self.skill.as_ref().map_or(0.02, |skill| 0.02 * skill.stats().reach_m);
+        let derived = self
+            .skill
+            .as_ref()
+            .map_or(0.02, |skill| 0.02 * skill.stats().reach_m);
         self.config.path_bound_m.unwrap_or(derived).max(1e-4)
     }
 
@@ -249,13 +255,17 @@ impl Session {
         match message {
             RobotControl::Info(info) => self.on_info(info),
             RobotControl::ModelStored { id } => {
-                if self.skill.as_ref().is_some_and(|skill| skill.id().0 == id) && !self.model_stored {
+                if self.skill.as_ref().is_some_and(|skill| skill.id().0 == id) && !self.model_stored
+                {
                     self.model_stored = true;
                     self.events.push_back(Event::Ready);
                 }
             }
             RobotControl::PlanStored { id } => {
-                if let Activity::Play { plan, engaged: engaged @ false } = &mut self.activity
+                if let Activity::Play {
+                    plan,
+                    engaged: engaged @ false,
+                } = &mut self.activity
                     && *plan == id
                 {
                     *engaged = true;
@@ -263,11 +273,21 @@ impl Session {
                     self.last_sent = now;
                 }
             }
-            RobotControl::Engaged { engagement, hand_m, tip_m, .. } => {
-                self.events.push_back(Event::Engaged { engagement, hand_m, tip_m });
+            RobotControl::Engaged {
+                engagement,
+                hand_m,
+                tip_m,
+                ..
+            } => {
+                self.events.push_back(Event::Engaged {
+                    engagement,
+                    hand_m,
+                    tip_m,
+                });
             }
             RobotControl::Refused { reason } => {
-                if let (Refusal::Diverged, Activity::Mirror(mirror)) = (reason, &mut self.activity) {
+                if let (Refusal::Diverged, Activity::Mirror(mirror)) = (reason, &mut self.activity)
+                {
                     mirror.go_without_model();
                 } else {
                     self.activity = Activity::Nothing;
@@ -284,7 +304,12 @@ impl Session {
         match RobotDatagram::decode(bytes) {
             Ok(RobotDatagram::Ping { epoch, t1_us }) if epoch == self.epoch => {
                 let t_us = now.0 / 1000;
-                self.datagram(&OperatorDatagram::Pong { epoch, t1_us, t2_us: t_us, t3_us: t_us });
+                self.datagram(&OperatorDatagram::Pong {
+                    epoch,
+                    t1_us,
+                    t2_us: t_us,
+                    t3_us: t_us,
+                });
             }
             Ok(RobotDatagram::Telemetry(telemetry)) if telemetry.epoch == self.epoch => {
                 if let Activity::Mirror(mirror) = &mut self.activity
@@ -294,7 +319,11 @@ impl Session {
                 }
                 if telemetry.delay_ms > 0 {
                     let delay_s = f64::from(telemetry.delay_ms) * 1e-3;
-                    self.delay_s += if self.delay_s == 0.0 { delay_s } else { 0.1 * (delay_s - self.delay_s) };
+                    self.delay_s += if self.delay_s == 0.0 {
+                        delay_s
+                    } else {
+                        0.1 * (delay_s - self.delay_s)
+                    };
                 }
                 self.events.push_back(Event::Telemetry(Box::new(telemetry)));
             }
@@ -305,7 +334,11 @@ impl Session {
     /// The hand, live. Samples out of order or not finite are dropped and counted.
     pub fn handle_sample(&mut self, now: Stamp, sample: HandSample) {
         let Some(hand) = &mut self.hand else {
-            self.hand = sample.x.iter().all(|v| v.is_finite()).then(|| HandState::first(sample.t, sample.x));
+            self.hand = sample
+                .x
+                .iter()
+                .all(|v| v.is_finite())
+                .then(|| HandState::first(sample.t, sample.x));
             return;
         };
         let previous = *hand;
@@ -313,14 +346,19 @@ impl Session {
             self.counters.dropped += 1;
             return;
         }
-        let Activity::Mirror(mirror) = &mut self.activity else { return };
+        let Activity::Mirror(mirror) = &mut self.activity else {
+            return;
+        };
         let skill = self.skill.as_deref().filter(|_| self.model_stored);
         let lag_s = self.info.as_ref().map_or(0.0, |info| f64::from(info.lag_s));
         self.counters.samples += 1;
-        self.counters.knots += u32::from(mirror.take(&previous, *hand, skill, self.delay_s + lag_s));
+        self.counters.knots +=
+            u32::from(mirror.take(&previous, *hand, skill, self.delay_s + lag_s));
         let arrival = now.offset_by_secs(self.delay_s + lag_s);
         let silent_s = now.secs_since(self.last_sent);
-        if mirror.future_changed(arrival, self.config.future_bound) || silent_s >= self.config.max_silence_s {
+        if mirror.future_changed(arrival, self.config.future_bound)
+            || silent_s >= self.config.max_silence_s
+        {
             self.speak(now);
         }
     }
@@ -328,7 +366,8 @@ impl Session {
     /// Asks the robot to follow the hand; refused here if no sample has been taken yet.
     pub fn engage(&mut self, now: Stamp) {
         let Some(hand) = self.hand else {
-            self.events.push_back(Event::Refused(Refusal::StaleReference));
+            self.events
+                .push_back(Event::Refused(Refusal::StaleReference));
             return;
         };
         let skill = self.skill.as_deref().filter(|_| self.model_stored);
@@ -337,26 +376,41 @@ impl Session {
             return;
         };
         let Some((state, model, params)) = mirror.reference(skill)
+        let Some((state, model, params)) =
+            mirror.reference(self.skill.as_deref().filter(|_| self.model_stored))
         else {
-            self.events.push_back(Event::Refused(Refusal::StaleReference));
+            self.events
+                .push_back(Event::Refused(Refusal::StaleReference));
             return;
         };
         self.activity = Activity::Mirror(Box::new(mirror));
-        self.request(Drive::Mirror { state, model, params });
+        self.request(Drive::Mirror {
+            state,
+            model,
+            params,
+        });
         self.last_sent = now;
     }
 
     /// Sends a motion and plays it as soon as the robot has it.
     pub fn play(&mut self, plan: &Plan<3>) {
         self.plans += 1;
-        self.activity = Activity::Play { plan: self.plans, engaged: false };
-        self.control(&OperatorControl::Plan { id: self.plans, bytes: codec::encode(plan) });
+        self.activity = Activity::Play {
+            plan: self.plans,
+            engaged: false,
+        };
+        self.control(&OperatorControl::Plan {
+            id: self.plans,
+            bytes: codec::encode(plan),
+        });
     }
 
     /// Lets go of the clutch.
     pub fn release(&mut self) {
         if !matches!(self.activity, Activity::Nothing) {
-            self.control(&OperatorControl::Release { engagement: self.engagement });
+            self.control(&OperatorControl::Release {
+                engagement: self.engagement,
+            });
             self.activity = Activity::Nothing;
         }
     }
@@ -404,7 +458,9 @@ impl Session {
     /// When to call [`Session::handle_timeout`], and for what.
     pub fn poll_timeout(&self) -> Option<(Stamp, &'static str)> {
         let stop = self.next_stop.map(|due| (due, "repeat the emergency stop"));
-        let word = self.next_word().map(|due| (due, "confirm before the silence grows too long"));
+        let word = self
+            .next_word()
+            .map(|due| (due, "confirm before the silence grows too long"));
         match (stop, word) {
             (Some(a), Some(b)) => Some(if b.0 < a.0 { b } else { a }),
             (a, b) => a.or(b),
@@ -436,7 +492,9 @@ impl Session {
             },
             Activity::Mirror(mirror) => {
                 let skill = self.skill.as_deref().filter(|_| self.model_stored);
-                let Some(mut motion) = mirror.motion(skill) else { return };
+                let Some(mut motion) = mirror.motion(skill) else {
+                    return;
+                };
                 motion.epoch = self.epoch;
                 motion.engagement = self.engagement;
                 motion.seq = self.seq;
@@ -445,7 +503,10 @@ impl Session {
             }
         };
         self.counters.messages += 1;
-        self.outputs.push_back(Output::Datagram { bytes: datagram.encode(), motion: true });
+        self.outputs.push_back(Output::Datagram {
+            bytes: datagram.encode(),
+            motion: true,
+        });
     }
 
     fn on_info(&mut self, info: Info) {
@@ -486,7 +547,12 @@ impl Session {
             engagement: self.engagement,
             drive,
             scale: self.scale().unwrap_or(0.1) as f32,
-            rotation: [rotation.w as f32, rotation.i as f32, rotation.j as f32, rotation.k as f32],
+            rotation: [
+                rotation.w as f32,
+                rotation.i as f32,
+                rotation.j as f32,
+                rotation.k as f32,
+            ],
             path_bound_um: (self.path_bound_m() * 1e6).round() as u32,
             lease_ms: (self.config.lease_s * 1e3) as u16,
         };
@@ -498,6 +564,9 @@ impl Session {
     }
 
     fn datagram(&mut self, message: &OperatorDatagram) {
-        self.outputs.push_back(Output::Datagram { bytes: message.encode(), motion: false });
+        self.outputs.push_back(Output::Datagram {
+            bytes: message.encode(),
+            motion: false,
+        });
     }
 }

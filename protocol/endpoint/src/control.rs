@@ -51,7 +51,11 @@ impl Control {
     /// [`ControlError::Connection`].
     pub async fn open(connection: &Connection) -> Result<Self, ControlError> {
         let (send, recv) = connection.open_bi().await?;
-        Ok(Self { send, recv, read: Vec::new() })
+        Ok(Self {
+            send,
+            recv,
+            read: Vec::new(),
+        })
     }
 
     /// Waits for the stream (robot).
@@ -59,9 +63,14 @@ impl Control {
     /// # Errors
     /// [`ControlError`], also if the peer opens none in time.
     pub async fn accept(connection: &Connection) -> Result<Self, ControlError> {
-        let (send, recv) =
-            timeout(GREETING_TIMEOUT, connection.accept_bi()).await.map_err(|_| ControlError::Silent)??;
-        Ok(Self { send, recv, read: Vec::new() })
+        let (send, recv) = timeout(GREETING_TIMEOUT, connection.accept_bi())
+            .await
+            .map_err(|_| ControlError::Silent)??;
+        Ok(Self {
+            send,
+            recv,
+            read: Vec::new(),
+        })
     }
 
     /// Reads the operator's greeting.
@@ -85,7 +94,10 @@ impl Control {
     /// # Errors
     /// [`ControlError::Stream`].
     pub async fn write(&mut self, bytes: &[u8]) -> Result<(), ControlError> {
-        self.send.write_all(bytes).await.map_err(|e| ControlError::Stream(e.to_string()))
+        self.send
+            .write_all(bytes)
+            .await
+            .map_err(|e| ControlError::Stream(e.to_string()))
     }
 
     /// Greetings are over: frames arrive on the receiver, after whose last item the stream has ended.
@@ -108,13 +120,17 @@ impl Control {
                 let mut buffer = [0; hello::MAX_LEN];
                 match self.recv.read(&mut buffer).await {
                     Ok(Some(n)) => self.read.extend_from_slice(&buffer[..n]),
-                    Ok(None) => return Err(ControlError::Stream("ended before the greeting".into())),
+                    Ok(None) => {
+                        return Err(ControlError::Stream("ended before the greeting".into()));
+                    }
                     Err(quinn::ReadError::ConnectionLost(e)) => return Err(e.into()),
                     Err(e) => return Err(ControlError::Stream(e.to_string())),
                 }
             }
         };
-        timeout(GREETING_TIMEOUT, read).await.map_err(|_| ControlError::Silent)?
+        timeout(GREETING_TIMEOUT, read)
+            .await
+            .map_err(|_| ControlError::Silent)?
     }
 }
 
@@ -123,10 +139,16 @@ impl Control {
 /// # Errors
 /// [`ControlError::Stream`] if the stream has ended.
 pub async fn write_frame(send: &mut SendStream, payload: &[u8]) -> Result<(), ControlError> {
-    send.write_all(&frame::encode(payload, false)).await.map_err(|e| ControlError::Stream(e.to_string()))
+    send.write_all(&frame::encode(payload, false))
+        .await
+        .map_err(|e| ControlError::Stream(e.to_string()))
 }
 
-async fn read_frames(mut recv: RecvStream, read: Vec<u8>, tx: mpsc::Sender<Result<Frame, ControlError>>) {
+async fn read_frames(
+    mut recv: RecvStream,
+    read: Vec<u8>,
+    tx: mpsc::Sender<Result<Frame, ControlError>>,
+) {
     let mut deframer = Deframer::default();
     deframer.push(&read);
     let mut buffer = vec![0; 16 * 1024];

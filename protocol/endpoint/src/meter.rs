@@ -35,7 +35,10 @@ pub struct Traffic {
 
 impl Traffic {
     fn since(self, earlier: Self) -> Self {
-        Self { packets: self.packets - earlier.packets, bytes: self.bytes - earlier.bytes }
+        Self {
+            packets: self.packets - earlier.packets,
+            bytes: self.bytes - earlier.bytes,
+        }
     }
 
     fn add(&mut self, packets: u64, udp_bytes: u64) {

@@ -9,7 +9,14 @@ fn origin(state: &WireState, grid: PathGrid) -> (i64, [i32; 3]) {
     let state = state.dequantise();
     let steps = state.x / grid.step_m();
     // `as` saturates; both ends compute it from the same integers.
-    (state.t.0.div_euclid(TICK_NS), [steps.x.round() as i32, steps.y.round() as i32, steps.z.round() as i32])
+    (
+        state.t.0.div_euclid(TICK_NS),
+        [
+            steps.x.round() as i32,
+            steps.y.round() as i32,
+            steps.z.round() as i32,
+        ],
+    )
 }
 
 fn difference(a: [i32; 3], b: [i32; 3]) -> [i32; 3] {
@@ -21,7 +28,11 @@ pub fn pack(state: &WireState, grid: PathGrid, knots: &[PathKnot]) -> Option<Vec
     let (mut tick, mut x) = origin(state, grid);
     let mut packed = Vec::with_capacity(knots.len());
     for (i, knot) in knots.iter().enumerate() {
-        let ticks = if i == 0 { tick - knot.tick } else { knot.tick - tick };
+        let ticks = if i == 0 {
+            tick - knot.tick
+        } else {
+            knot.tick - tick
+        };
         let ticks = u32::try_from(ticks).ok().filter(|&n| n < 1 << 31)?;
         packed.push(WireKnot {
             dt: ticks << 1 | u32::from(knot.start),
@@ -42,9 +53,18 @@ pub fn unpack<'a>(
     let (mut tick, mut x) = origin(state, grid);
     knots.iter().enumerate().map(move |(i, knot)| {
         let ticks = i64::from(knot.dt >> 1);
-        tick = if i == 0 { tick.saturating_sub(ticks) } else { tick.saturating_add(ticks) };
+        tick = if i == 0 {
+            tick.saturating_sub(ticks)
+        } else {
+            tick.saturating_add(ticks)
+        };
         x = core::array::from_fn(|d| x[d].wrapping_add(knot.dx[d]));
-        PathKnot { tick, x, v: knot.v, start: knot.dt & 1 == 1 }
+        PathKnot {
+            tick,
+            x,
+            v: knot.v,
+            start: knot.dt & 1 == 1,
+        }
     })
 }
 
@@ -60,8 +80,17 @@ mod tests {
         let grid = PathGrid::for_bound(0.02).unwrap();
         let state = HandState::first(Stamp(3_000_000_000), Vector3::new(0.4, -0.2, 2.5));
         let state = WireState::quantise(&state).unwrap();
-        let knot = |ms: i64, x, start| PathKnot { tick: ms * 100, x, v: [3, -400, 0], start };
-        let knots = [knot(2_400, [70, -40, 500], true), knot(2_700, [80, -41, 502], false), knot(3_000, [81, 0, 1], false)];
+        let knot = |ms: i64, x, start| PathKnot {
+            tick: ms * 100,
+            x,
+            v: [3, -400, 0],
+            start,
+        };
+        let knots = [
+            knot(2_400, [70, -40, 500], true),
+            knot(2_700, [80, -41, 502], false),
+            knot(3_000, [81, 0, 1], false),
+        ];
         let packed = pack(&state, grid, &knots).unwrap();
         assert_eq!(unpack(&state, grid, &packed).collect::<Vec<_>>(), knots);
         assert_eq!(pack(&state, grid, &[knot(3_001, [0; 3], true)]), None);

@@ -309,13 +309,21 @@ impl WireParams {
     /// The nearest parameters that can travel.
     pub fn quantise(params: &Params) -> Self {
         let step = |v: f64| (v * 255.0).round() as u8;
-        Self { gain: step(params.gain), trust: step(params.trust), cv_damping: step(params.cv_damping) }
+        Self {
+            gain: step(params.gain),
+            trust: step(params.trust),
+            cv_damping: step(params.cv_damping),
+        }
     }
 
     /// The parameters both ends use.
     pub fn dequantise(self) -> Params {
         let value = |v: u8| f64::from(v) / 255.0;
-        Params { gain: value(self.gain), trust: value(self.trust), cv_damping: value(self.cv_damping) }
+        Params {
+            gain: value(self.gain),
+            trust: value(self.trust),
+            cv_damping: value(self.cv_damping),
+        }
     }
 }
 

@@ -37,7 +37,10 @@ pub struct Trajectory {
 
 /// What drives an engagement.
 #[derive(Debug)]
-#[expect(clippy::large_enum_variant, reason = "a box would be allocated per message and freed on the tick")]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "a box would be allocated per message and freed on the tick"
+)]
 pub enum Source {
     /// The hand, live: a forecast and when its state was valid on the robot's clock.
     Mirror {
@@ -174,10 +177,24 @@ pub fn rings() -> (Rings, Handle) {
     let (order_in, orders) = rtrb::RingBuffer::new(64);
     let (reports, report_out) = rtrb::RingBuffer::new(4096);
     let (spent, spent_out) = rtrb::RingBuffer::new(64);
-    (Rings { orders, reports, spent }, Handle { orders: order_in, reports: report_out, spent: spent_out })
+    (
+        Rings {
+            orders,
+            reports,
+            spent,
+        },
+        Handle {
+            orders: order_in,
+            reports: report_out,
+            spent: spent_out,
+        },
+    )
 }
 
-#[expect(clippy::large_enum_variant, reason = "a box would be allocated per message and freed on the tick")]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "a box would be allocated per message and freed on the tick"
+)]
 enum Drive {
     Nothing,
     Mirror { forecast: Forecast, valid_at: Mono },
@@ -208,8 +225,12 @@ impl Core {
     /// A servo at rest.
     pub fn new(config: CoreConfig, controller: Controller, plant: Plant, rings: Rings) -> Self {
         let tip_m = controller.reference().p;
-        let mapping =
-            Mapping { scale: 1.0, rotation: UnitQuaternion::identity(), hand_m: Vector3::zeros(), tip_m };
+        let mapping = Mapping {
+            scale: 1.0,
+            rotation: UnitQuaternion::identity(),
+            hand_m: Vector3::zeros(),
+            tip_m,
+        };
         Self {
             safety: Safety::new(config.safety),
             config,
@@ -242,7 +263,9 @@ impl Core {
         }
         self.safety.tick(now);
         let demand = self.demand(now);
-        let output = self.controller.tick(demand, self.plant.q(), self.plant.qd());
+        let output = self
+            .controller
+            .tick(demand, self.plant.q(), self.plant.qd());
         let strain = self.plant.step(&output.tau, self.config.tick_s);
         let limited = output.clamps != Clamps::default() || strain != PlantReport::default();
         if self.safety.is_following() && (limited || self.out_of_reach) {
@@ -262,8 +285,16 @@ impl Core {
         match order {
             Order::Operator(present) => self.safety.set_operator(present),
             Order::Engage(engagement) => self.engage(engagement, now),
-            Order::Track { forecast, valid_at, lease_s } => {
-                if let Drive::Mirror { forecast: held, valid_at: held_at } = &mut self.drive {
+            Order::Track {
+                forecast,
+                valid_at,
+                lease_s,
+            } => {
+                if let Drive::Mirror {
+                    forecast: held,
+                    valid_at: held_at,
+                } = &mut self.drive
+                {
                     *held = forecast;
                     *held_at = valid_at;
                     self.safety.news(now, lease_s);
@@ -288,13 +319,21 @@ impl Core {
         }
         let hand_m = match &drive {
             Drive::Mirror { forecast, valid_at } => forecast.at(now.secs_since(*valid_at)).position,
-            Drive::Play(trajectory) => trajectory.spline.eval(0.0).map_or(Vector3::zeros(), |jet| jet.x),
+            Drive::Play(trajectory) => trajectory
+                .spline
+                .eval(0.0)
+                .map_or(Vector3::zeros(), |jet| jet.x),
             Drive::Nothing => Vector3::zeros(),
         };
         let old = std::mem::replace(&mut self.drive, drive);
         self.discard(old);
         let tip_m = self.controller.reset_reference(self.plant.q());
-        self.mapping = Mapping { scale: engagement.scale, rotation: engagement.rotation, hand_m, tip_m };
+        self.mapping = Mapping {
+            scale: engagement.scale,
+            rotation: engagement.rotation,
+            hand_m,
+            tip_m,
+        };
         self.engagement = engagement.number;
         self.engaged_at = now;
         self.clamps = 0;
@@ -318,7 +357,9 @@ impl Core {
         let hand_m = match &self.drive {
             Drive::Nothing => return Demand::Stop,
             Drive::Mirror { forecast, valid_at } => {
-                forecast.at(now.secs_since(*valid_at) + self.config.lag_s).position
+                forecast
+                    .at(now.secs_since(*valid_at) + self.config.lag_s)
+                    .position
             }
             Drive::Play(trajectory) => {
                 if since_s > trajectory.duration_s + SETTLE_S {
@@ -326,13 +367,19 @@ impl Core {
                     return Demand::Stop;
                 }
                 let t_s = (since_s + self.config.lag_s).min(trajectory.duration_s);
-                trajectory.spline.eval(t_s).map_or(self.mapping.hand_m, |jet| jet.x)
+                trajectory
+                    .spline
+                    .eval(t_s)
+                    .map_or(self.mapping.hand_m, |jet| jet.x)
             }
         };
         let (placed, clamped) = self.mapping.place(hand_m, self.config.radius_m);
         self.out_of_reach = clamped;
         self.target_m = self.mapping.tip_m + (placed - self.mapping.tip_m) * ramp(since_s / RAMP_S);
-        Demand::Follow { target: self.target_m, speed_scale: self.safety.speed_scale(now) }
+        Demand::Follow {
+            target: self.target_m,
+            speed_scale: self.safety.speed_scale(now),
+        }
     }
 
     fn report(&self, now: Mono) -> Report {

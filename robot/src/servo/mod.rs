@@ -8,6 +8,9 @@ mod mapping;
 mod stats;
 pub mod thread;
 
-pub use self::core::{Core, CoreConfig, Engagement, Handle, Order, RAMP_S, Report, Rings, Source, Trajectory, ramp, rings};
+pub use self::core::{
+    Core, CoreConfig, Engagement, Handle, Order, RAMP_S, Report, Rings, Source, Trajectory, ramp,
+    rings,
+};
 pub use mapping::Mapping;
 pub use stats::TickStats;

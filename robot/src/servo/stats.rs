@@ -13,7 +13,11 @@ pub struct TickStats {
 
 impl Default for TickStats {
     fn default() -> Self {
-        Self { buckets: [0; BUCKETS], count: 0, sum_ns: 0 }
+        Self {
+            buckets: [0; BUCKETS],
+            count: 0,
+            sum_ns: 0,
+        }
     }
 }
 

@@ -60,9 +60,14 @@ impl Servo {
         let timing = Arc::new(Timing::default());
         let quit = Arc::new(AtomicBool::new(false));
         let (shared, stop) = (timing.clone(), quit.clone());
-        let thread =
-            std::thread::Builder::new().name("servo".into()).spawn(move || run(core, &shared, &stop))?;
-        Ok(Self { timing, quit, thread: Some(thread) })
+        let thread = std::thread::Builder::new()
+            .name("servo".into())
+            .spawn(move || run(core, &shared, &stop))?;
+        Ok(Self {
+            timing,
+            quit,
+            thread: Some(thread),
+        })
     }
 }
 
@@ -83,7 +88,10 @@ fn run(mut core: Core, timing: &Timing, quit: &AtomicBool) {
     let mut due = now().0;
     while !quit.load(Ordering::Relaxed) {
         due += period_ns;
-        let until = Timespec { tv_sec: due / 1_000_000_000, tv_nsec: due % 1_000_000_000 };
+        let until = Timespec {
+            tv_sec: due / 1_000_000_000,
+            tv_nsec: due % 1_000_000_000,
+        };
         while clock_nanosleep_absolute(ClockId::Monotonic, &until).is_err() {}
         let begun = now();
         if begun.0 - due > period_ns {
@@ -97,7 +105,9 @@ fn run(mut core: Core, timing: &Timing, quit: &AtomicBool) {
         stats.add((now().0 - begun.0).clamp(0, i64::from(u32::MAX)) as u32);
         if stats.count() % 64 == 0 {
             timing.mean_ns.store(stats.mean_ns(), Ordering::Relaxed);
-            timing.p99_ns.store(stats.quantile_ns(0.99), Ordering::Relaxed);
+            timing
+                .p99_ns
+                .store(stats.quantile_ns(0.99), Ordering::Relaxed);
             timing.overruns.store(overruns, Ordering::Relaxed);
             timing.ticks.store(stats.count(), Ordering::Relaxed);
         }

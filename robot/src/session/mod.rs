@@ -19,8 +19,8 @@ use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::v1::{
-    Cause, Drive, Engage, Info, MAX_PLAN_LEN, Message, ModelId, OperatorControl, OperatorDatagram, Refusal,
-    RobotControl, RobotDatagram, RobotState, Telemetry,
+    Cause, Drive, Engage, Info, MAX_PLAN_LEN, Message, ModelId, OperatorControl, OperatorDatagram,
+    Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
 };
 
 use crate::clock::{SessionClock, Slew};
@@ -43,13 +43,19 @@ pub struct SessionConfig {
 
 impl Default for SessionConfig {
     fn default() -> Self {
-        Self { telemetry_s: 0.05, max_delay_s: 0.5 }
+        Self {
+            telemetry_s: 0.05,
+            max_delay_s: 0.5,
+        }
     }
 }
 
 /// What a session wants done.
 #[derive(Debug)]
-#[expect(clippy::large_enum_variant, reason = "moved once, into the servo's ring")]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "moved once, into the servo's ring"
+)]
 pub enum Output {
     /// A message for the control stream, not yet framed.
     Control(Vec<u8>),
@@ -175,13 +181,15 @@ impl Session {
         };
         match message {
             OperatorControl::Model { id, bytes } => self.store_model(id, &bytes),
-            OperatorControl::Plan { id, bytes } => match codec::decode::<Plan<3>, MAX_PLAN_LEN>(&bytes) {
-                Ok(plan) => {
-                    self.plan = Some((id, plan));
-                    self.send(&RobotControl::PlanStored { id });
+            OperatorControl::Plan { id, bytes } => {
+                match codec::decode::<Plan<3>, MAX_PLAN_LEN>(&bytes) {
+                    Ok(plan) => {
+                        self.plan = Some((id, plan));
+                        self.send(&RobotControl::PlanStored { id });
+                    }
+                    Err(_) => self.refuse(Refusal::BadPlan),
                 }
-                Err(_) => self.refuse(Refusal::BadPlan),
-            },
+            }
             OperatorControl::Engage(engage) => {
                 if let Err(reason) = self.engage(now, &engage) {
                     self.refuse(reason);
@@ -203,12 +211,26 @@ impl Session {
     pub fn handle_datagram(&mut self, now: Mono, bytes: &[u8]) {
         let taken = match OperatorDatagram::decode(bytes) {
             Ok(OperatorDatagram::Motion(motion)) => self.on_motion(now, &motion),
-            Ok(OperatorDatagram::Go { epoch, engagement, seq, t_us, lease_ms }) => {
-                self.on_go(now, epoch, engagement, seq, t_us, lease_ms)
-            }
-            Ok(OperatorDatagram::Pong { epoch, t1_us, t2_us, t3_us }) if epoch == self.epoch => {
+            Ok(OperatorDatagram::Go {
+                epoch,
+                engagement,
+                seq,
+                t_us,
+                lease_ms,
+            }) => self.on_go(now, epoch, engagement, seq, t_us, lease_ms),
+            Ok(OperatorDatagram::Pong {
+                epoch,
+                t1_us,
+                t2_us,
+                t3_us,
+            }) if epoch == self.epoch => {
                 let stamp = |us: i64| Stamp(us.saturating_mul(1000));
-                self.clock.observe(Mono(t1_us.saturating_mul(1000)), stamp(t2_us), stamp(t3_us), now);
+                self.clock.observe(
+                    Mono(t1_us.saturating_mul(1000)),
+                    stamp(t2_us),
+                    stamp(t3_us),
+                    now,
+                );
                 self.follow_clock(now);
                 true
             }
@@ -229,10 +251,15 @@ impl Session {
         let changed = self.transitions != Some(report.transitions);
         self.transitions = Some(report.transitions);
         self.report = Some(*report);
-        if self.engagement != 0 && report.engagement == self.engagement && self.acknowledged != self.engagement
+        if self.engagement != 0
+            && report.engagement == self.engagement
+            && self.acknowledged != self.engagement
         {
             self.acknowledged = self.engagement;
-            let t_us = self.clock.to_session(report.engaged_at).map_or(0, |t| t.0 / 1000);
+            let t_us = self
+                .clock
+                .to_session(report.engaged_at)
+                .map_or(0, |t| t.0 / 1000);
             self.send(&RobotControl::Engaged {
                 engagement: report.engagement,
                 t_us,
@@ -241,7 +268,10 @@ impl Session {
             });
         }
         if changed {
-            self.send(&RobotControl::State { state: report.state, cause: report.cause });
+            self.send(&RobotControl::State {
+                state: report.state,
+                cause: report.cause,
+            });
         }
     }
 
@@ -249,9 +279,16 @@ impl Session {
     pub fn handle_timeout(&mut self, now: Mono) {
         if now >= self.next_ping {
             self.pings += 1;
-            let gap_s = if self.pings < QUICK_PINGS { QUICK_PING_S } else { PING_S };
+            let gap_s = if self.pings < QUICK_PINGS {
+                QUICK_PING_S
+            } else {
+                PING_S
+            };
             self.next_ping = now.offset_by_secs(gap_s);
-            let ping = RobotDatagram::Ping { epoch: self.epoch, t1_us: now.0 / 1000 };
+            let ping = RobotDatagram::Ping {
+                epoch: self.epoch,
+                t1_us: now.0 / 1000,
+            };
             self.outputs.push_back(Output::Datagram(ping.encode()));
         }
         if now >= self.next_telemetry {
@@ -310,7 +347,11 @@ impl Session {
         // From here on an estimate may be applied at once: nothing is being followed.
         self.clock.slew(now, false);
         let (source, mirror) = match &engage.drive {
-            Drive::Mirror { state, model, params } => {
+            Drive::Mirror {
+                state,
+                model,
+                params,
+            } => {
                 let mirror = Mirror::new(engage.path_bound_um).ok_or(Refusal::BadMapping)?;
                 let state = state.dequantise();
                 let valid_at = self.clock.to_mono(state.t).ok_or(Refusal::ClockUnknown)?;
@@ -322,10 +363,17 @@ impl Session {
                 (Source::Mirror { forecast, valid_at }, Some(mirror))
             }
             Drive::Play { plan } => {
-                let (_, held) = self.plan.as_ref().filter(|(id, _)| id == plan).ok_or(Refusal::BadPlan)?;
+                let (_, held) = self
+                    .plan
+                    .as_ref()
+                    .filter(|(id, _)| id == plan)
+                    .ok_or(Refusal::BadPlan)?;
                 let spline = held.spline().map_err(|_| Refusal::BadPlan)?;
                 let duration_s = spline.span_s().1;
-                (Source::Play(Box::new(Trajectory { spline, duration_s })), None)
+                (
+                    Source::Play(Box::new(Trajectory { spline, duration_s })),
+                    None,
+                )
             }
         };
         self.engagement = engage.engagement;
@@ -341,8 +389,9 @@ impl Session {
     }
 
     fn follow_clock(&mut self, now: Mono) {
-        let following =
-            self.report.is_some_and(|r| matches!(r.state, RobotState::Engaged | RobotState::Coasting));
+        let following = self
+            .report
+            .is_some_and(|r| matches!(r.state, RobotState::Engaged | RobotState::Coasting));
         if self.clock.slew(now, following) == Slew::Step {
             self.order(Order::Hold(Cause::ClockStep));
         }
@@ -352,7 +401,10 @@ impl Session {
         let report = self.report?;
         self.telemetry_seq += 1;
         let milliseconds = |s: f64| (s * 1e3).round().clamp(0.0, f64::from(u16::MAX)) as u16;
-        let uncertainty_us = self.clock.uncertainty_s(now).map_or(f64::from(u32::MAX), |s| s * 1e6);
+        let uncertainty_us = self
+            .clock
+            .uncertainty_s(now)
+            .map_or(f64::from(u32::MAX), |s| s * 1e6);
         Some(Telemetry {
             epoch: self.epoch,
             seq: self.telemetry_seq,
@@ -371,7 +423,12 @@ impl Session {
             tick_p99_ns: self.timing.p99_ns,
             overruns: self.timing.overruns,
             tip_m: report.tip_m.cast::<f32>().into(),
-            q: report.q.iter().take(usize::from(self.info.joints)).map(|&v| v as f32).collect(),
+            q: report
+                .q
+                .iter()
+                .take(usize::from(self.info.joints))
+                .map(|&v| v as f32)
+                .collect(),
         })
     }
 

@@ -29,9 +29,13 @@ impl Session {
         if motion.epoch != self.epoch || motion.engagement != self.engagement {
             return false;
         }
-        let Some(mirror) = &mut self.mirror else { return false };
+        let Some(mirror) = &mut self.mirror else {
+            return false;
+        };
         let state = motion.state.dequantise();
-        let Some(valid_at) = self.clock.to_mono(state.t) else { return false };
+        let Some(valid_at) = self.clock.to_mono(state.t) else {
+            return false;
+        };
         let age_s = now.secs_since(valid_at);
         if age_s < -self.config.max_delay_s {
             return false;
@@ -47,7 +51,8 @@ impl Session {
             return fresh;
         }
         mirror.newest_t = state.t;
-        let lease_s = f64::from(motion.lease_ms) * 1e-3 - (age_s - self.config.max_delay_s).max(0.0);
+        let lease_s =
+            f64::from(motion.lease_ms) * 1e-3 - (age_s - self.config.max_delay_s).max(0.0);
         if lease_s <= 0.0 {
             return false;
         }
@@ -55,7 +60,9 @@ impl Session {
         let diverged = mirror.diverged;
         let model = if diverged { 0 } else { motion.model };
         let mut forecast = self.forecast(&state, model, &motion.params.dequantise());
-        let checked = motion.checksum.filter(|_| !diverged && self.predicts_with(motion.model));
+        let checked = motion
+            .checksum
+            .filter(|_| !diverged && self.predicts_with(motion.model));
         if checked.is_some_and(|sum| sum != forecast.checksum()) {
             forecast = Forecast::constant_velocity(&state, &motion.params.dequantise());
             if let Some(mirror) = &mut self.mirror {
@@ -63,7 +70,11 @@ impl Session {
             }
             self.refuse(Refusal::Diverged);
         }
-        self.order(Order::Track { forecast, valid_at, lease_s });
+        self.order(Order::Track {
+            forecast,
+            valid_at,
+            lease_s,
+        });
         true
     }
 
@@ -83,7 +94,9 @@ impl Session {
         if seq <= self.newest_seq {
             return false;
         }
-        let Some(sent_at) = self.clock.to_mono(Stamp(t_us.saturating_mul(1000))) else { return false };
+        let Some(sent_at) = self.clock.to_mono(Stamp(t_us.saturating_mul(1000))) else {
+            return false;
+        };
         let age_s = now.secs_since(sent_at);
         let lease_s = f64::from(lease_ms) * 1e-3 - (age_s - self.config.max_delay_s).max(0.0);
         if lease_s <= 0.0 {
@@ -105,7 +118,11 @@ impl Session {
     }
 
     fn predicts_with(&self, model: u16) -> bool {
-        model != 0 && self.skill.as_ref().is_some_and(|skill| model_tag(&skill.id().0) == model)
+        model != 0
+            && self
+                .skill
+                .as_ref()
+                .is_some_and(|skill| model_tag(&skill.id().0) == model)
     }
 }
 
@@ -114,7 +131,13 @@ impl Mirror {
     pub(super) fn new(bound_um: u32) -> Option<Self> {
         let grid = PathGrid::for_bound(f64::from(bound_um) * 1e-6).ok()?;
         let path = PathDecoder::new(grid, PATH_KNOTS);
-        Some(Self { grid, path, frontier: 0, newest_t: Stamp(i64::MIN), diverged: false })
+        Some(Self {
+            grid,
+            path,
+            frontier: 0,
+            newest_t: Stamp(i64::MIN),
+            diverged: false,
+        })
     }
 
     /// Knots held without a gap.
@@ -129,7 +152,9 @@ impl Mirror {
 
     fn take_knots(&mut self, motion: &Motion) {
         // A message that begins beyond the frontier leaves a gap: its knots come again.
-        let Some(known) = self.frontier.checked_sub(motion.first_knot) else { return };
+        let Some(known) = self.frontier.checked_sub(motion.first_knot) else {
+            return;
+        };
         for knot in knots::unpack(&motion.state, self.grid, &motion.knots).skip(known as usize) {
             if self.path.append(&knot).is_err() {
                 return;

@@ -4,14 +4,18 @@ use nalgebra::SVector;
 
 use super::super::{Checkpoint, CheckpointError, Grid, MAX_POINTS, Plan, check_series};
 
-/// Sample evaluations spent on making a sufficient choice smaller: about half a second.
-const REFINING_EFFORT: usize = 1 << 23;
+/// Sample evaluations spent on making a sufficient choice smaller: a few tenths of a second.
+const REFINING_EFFORT: usize = 1 << 22;
+
+/// The choice starts with a curve within this many bounds of the samples. Which start ends with fewer
+/// points depends on the motion, so both are tried.
+const STARTS: [f64; 2] = [1.0, 8.0];
 
 /// Checkpoints of the motion `y` (m) at times `t` (s from its start, not negative, increasing) whose
 /// decoded curve passes within `bound_m` of *every* sample.
 ///
 /// Starts from equal shares of √|Laplacian| (the curvature), inserts the worst sample until the bound
-/// holds on the decoded, quantised curve, then drops points, and moves the others, while it still
+/// holds on the decoded, quantised curve, then drops points, and moves the others, as long as it
 /// holds. How it chooses is free; what [`Plan`] decodes to is not.
 ///
 /// # Errors
@@ -25,20 +29,29 @@ pub fn bounded<const D: usize>(
     let coarse = Grid::for_bound(bound_m)?;
     check_series(t, y)?;
     let slopes = slopes(t, y);
-    let mut chooser = Chooser {
-        t,
-        y,
-        slopes: &slopes,
-        bound_m,
-        grid: coarse,
-        effort: 0,
+    let attempt = |grid, near| {
+        let mut chooser = Chooser {
+            t,
+            y,
+            slopes: &slopes,
+            bound_m,
+            grid,
+            effort: 0,
+        };
+        chooser.choose(near)
     };
-    match chooser.choose() {
+    let fewest = |grid| {
+        let [sure, bold] = STARTS.map(|near| attempt(grid, near));
+        match (sure, bold) {
+            (Ok(sure), Ok(bold)) if bold.len() < sure.len() => Ok(bold),
+            (Ok(plan), _) | (Err(_), Ok(plan)) => Ok(plan),
+            (Err(e), Err(_)) => Err(e),
+        }
+    };
+    match fewest(coarse) {
         // Sample times off the millisecond grid, and a bound tighter than that rounding.
         Err(CheckpointError::Unreachable { .. } | CheckpointError::Unordered { .. }) => {
-            chooser.grid = coarse.with_fine_ticks();
-            chooser.effort = 0;
-            chooser.choose()
+            fewest(coarse.with_fine_ticks())
         }
         other => other,
     }
@@ -54,8 +67,8 @@ struct Chooser<'a, const D: usize> {
 }
 
 impl<const D: usize> Chooser<'_, D> {
-    fn choose(&mut self) -> Result<Plan<D>, CheckpointError> {
-        let mut kept = self.start();
+    fn choose(&mut self, near: f64) -> Result<Plan<D>, CheckpointError> {
+        let mut kept = self.start(near);
         loop {
             let errors = self.errors(&kept)?;
             let (worst, &error_m) = errors
@@ -84,33 +97,50 @@ impl<const D: usize> Chooser<'_, D> {
         self.plan(&kept)
     }
 
-    /// Both ends, and equal shares of ∫√(|x''|/8ε) dt between them: one share is what a straight line
-    /// covers within ε, and a cubic covers at least two.
-    fn start(&self) -> Vec<usize> {
+    /// Both ends, and equal shares of ∫√|x''| dt between them: half as many again until the curve
+    /// is within `near` bounds. Greedy insertion goes on from there.
+    fn start(&mut self, near: f64) -> Vec<usize> {
         let n = self.t.len();
         let mut share = vec![0.0; n];
         for i in 1..n {
             let step_s = self.t[i] - self.t[i - 1];
             let bend = (self.slopes[i] - self.slopes[i - 1]).norm() / step_s;
-            share[i] = share[i - 1] + (bend / (8.0 * self.bound_m)).sqrt() * step_s;
+            share[i] = share[i - 1] + bend.sqrt() * step_s;
         }
-        let spans = ((share[n - 1] / 2.0) as usize).clamp(1, (MAX_POINTS / 2).min(n - 1));
+        let mut spans = 1;
+        loop {
+            let kept = self.equal_shares(&share, spans);
+            let close = self.worst(&kept, near * self.bound_m).is_some();
+            if close || 2 * spans >= (MAX_POINTS / 2).min(n - 1) {
+                return kept;
+            }
+            spans += spans.div_ceil(2);
+        }
+    }
+
+    fn equal_shares(&self, share: &[f64], spans: usize) -> Vec<usize> {
+        let last = share.len() - 1;
         let mut kept = vec![0];
         for s in 1..spans {
-            let goal = share[n - 1] * s as f64 / spans as f64;
-            let i = share.partition_point(|&v| v < goal).min(n - 1);
-            if i < n - 1 && self.may_insert(&kept, i) {
+            let goal = share[last] * s as f64 / spans as f64;
+            let i = share.partition_point(|&v| v < goal).min(last);
+            if i < last && self.may_insert(&kept, i) {
                 kept.push(i);
             }
         }
-        if kept.len() > 1 && !self.apart(kept[kept.len() - 1], n - 1) {
+        if kept.len() > 1 && !self.apart(kept[kept.len() - 1], last) {
             kept.pop();
         }
-        kept.push(n - 1);
+        kept.push(last);
         kept
     }
 
     fn refine(&mut self, kept: &mut Vec<usize>) {
+        // Looking for the best point to drop costs a pass for each point dropped; where that is too
+        // much, drop what can be dropped in one pass.
+        if kept.len() * kept.len() * self.t.len() > REFINING_EFFORT {
+            self.thin(kept);
+        }
         while self.effort < REFINING_EFFORT && kept.len() > 2 {
             let mut best: Option<(f64, usize)> = None;
             for j in 1..kept.len() - 1 {
@@ -128,6 +158,18 @@ impl<const D: usize> Chooser<'_, D> {
                 break;
             }
             *kept = without;
+        }
+    }
+
+    fn thin(&mut self, kept: &mut Vec<usize>) {
+        let mut j = 1;
+        while j + 1 < kept.len() && self.effort < REFINING_EFFORT {
+            let dropped = kept.remove(j);
+            // `worst` is below its limit; the bound itself is allowed.
+            if self.worst(kept, self.bound_m.next_up()).is_none() {
+                kept.insert(j, dropped);
+                j += 1;
+            }
         }
     }
 
