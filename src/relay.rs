@@ -78,7 +78,11 @@ impl Relay {
     /// The system's, for example when the port is taken.
     pub async fn bind(config: RelayConfig, clock: HostClock) -> io::Result<Self> {
         let socket = Arc::new(UdpSocket::bind(config.listen).await?);
-        Ok(Self { socket, config, clock })
+        Ok(Self {
+            socket,
+            config,
+            clock,
+        })
     }
 
     /// Where it listens.
@@ -92,7 +96,10 @@ impl Relay {
     /// Passes packets on until `quit` turns true. `passages` hears of every packet once its fate is done.
     pub async fn run(self, mut quit: watch::Receiver<bool>, mut passages: impl FnMut(Passage)) {
         let mut up = Link::new(self.config.up.clone(), self.config.seed);
-        let mut down = Link::new(self.config.down.clone(), self.config.seed ^ 0x9e37_79b9_7f4a_7c15);
+        let mut down = Link::new(
+            self.config.down.clone(),
+            self.config.seed ^ 0x9e37_79b9_7f4a_7c15,
+        );
         let mut clients: BTreeMap<SocketAddr, Client> = BTreeMap::new();
         let (tx, mut from_far) = mpsc::channel::<(SocketAddr, Vec<u8>)>(READ_AHEAD);
         // Packets on their way: by time of delivery, then by order of arrival.
@@ -101,7 +108,9 @@ impl Relay {
         let mut count = 0;
         let mut buffer = vec![0; MAX_PACKET];
         loop {
-            let next = due.peek().map(|Reverse((at, _))| self.clock.instant(Mono(*at)));
+            let next = due
+                .peek()
+                .map(|Reverse((at, _))| self.clock.instant(Mono(*at)));
             let packet = tokio::select! {
                 biased;
                 _ = quit.wait_for(|quit| *quit) => break,
@@ -145,7 +154,11 @@ impl Relay {
 
     async fn deliver(&self, packet: &Packet, clients: &BTreeMap<SocketAddr, Client>) -> bool {
         if !packet.up {
-            return self.socket.send_to(&packet.bytes, packet.client).await.is_ok();
+            return self
+                .socket
+                .send_to(&packet.bytes, packet.client)
+                .await
+                .is_ok();
         }
         match clients.get(&packet.client) {
             Some(client) => client.far.send(&packet.bytes).await.is_ok(),
@@ -166,20 +179,35 @@ impl Relay {
             return true;
         }
         if clients.len() >= MAX_CLIENTS
-            && let Some(oldest) = clients.iter().min_by_key(|(_, c)| c.last).map(|(addr, _)| *addr)
+            && let Some(oldest) = clients
+                .iter()
+                .min_by_key(|(_, c)| c.last)
+                .map(|(addr, _)| *addr)
             && let Some(gone) = clients.remove(&oldest)
         {
             gone.reader.abort();
         }
-        let any: IpAddr =
-            if self.config.to.is_ipv4() { Ipv4Addr::UNSPECIFIED.into() } else { Ipv6Addr::UNSPECIFIED.into() };
-        let Ok(far) = UdpSocket::bind((any, 0)).await else { return false };
+        let any: IpAddr = if self.config.to.is_ipv4() {
+            Ipv4Addr::UNSPECIFIED.into()
+        } else {
+            Ipv6Addr::UNSPECIFIED.into()
+        };
+        let Ok(far) = UdpSocket::bind((any, 0)).await else {
+            return false;
+        };
         if far.connect(self.config.to).await.is_err() {
             return false;
         }
         let far = Arc::new(far);
         let reader = tokio::spawn(read(far.clone(), client, tx.clone()));
-        clients.insert(client, Client { far, last: now, reader });
+        clients.insert(
+            client,
+            Client {
+                far,
+                last: now,
+                reader,
+            },
+        );
         true
     }
 }
@@ -197,5 +225,10 @@ async fn read(far: Arc<UdpSocket>, client: SocketAddr, tx: mpsc::Sender<(SocketA
 }
 
 fn passage(packet: &Packet, out: Option<Mono>) -> Passage {
-    Passage { at: packet.at, up: packet.up, len_bytes: packet.bytes.len() + IP_UDP_HEADER as usize, out }
+    Passage {
+        at: packet.at,
+        up: packet.up,
+        len_bytes: packet.bytes.len() + IP_UDP_HEADER as usize,
+        out,
+    }
 }

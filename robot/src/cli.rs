@@ -47,7 +47,12 @@ pub struct Args {
     #[arg(long, value_name = "JOINT=VALUE", value_parser = parse_fixed)]
     pub fixed: Vec<(String, f64)>,
     /// Start posture, one value per joint, rad or m [default: searched].
-    #[arg(long, value_name = "Q1,Q2,…", value_delimiter = ',', allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_name = "Q1,Q2,…",
+        value_delimiter = ',',
+        allow_negative_numbers = true
+    )]
     pub start: Option<Vec<f64>>,
     /// Write every tick to this CSV file.
     #[arg(long, value_name = "FILE")]
@@ -78,7 +83,9 @@ struct File {
 
 fn parse_fixed(text: &str) -> Result<(String, f64), String> {
     let (joint, value) = text.split_once('=').ok_or("write JOINT=VALUE")?;
-    let value = value.parse::<f64>().map_err(|e| format!("`{value}`: {e}"))?;
+    let value = value
+        .parse::<f64>()
+        .map_err(|e| format!("`{value}`: {e}"))?;
     Ok((joint.to_owned(), value))
 }
 
@@ -86,14 +93,50 @@ fn parse_fixed(text: &str) -> Result<(String, f64), String> {
 #[derive(Debug, Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 enum Event<'a> {
-    Listening { addr: SocketAddr, fingerprint: String, arm: &'a str, joints: usize, lag_s: f64, radius_m: f64 },
-    Connected { epoch: u32, peer: SocketAddr },
-    Disconnected { why: &'a str, received: u32, dropped: u32, clock_offset_s: Option<f64>, clock_bound_s: Option<f64> },
-    Refused { why: &'a str },
-    State { state: String, cause: String, mono_ns: i64 },
-    Engaged { engagement: u32, mono_ns: i64, scale: f64, rotation: [f64; 4], hand_m: [f64; 3], tip_m: [f64; 3] },
-    Path { knots: &'a [(f64, [f64; 3], [f64; 3])] },
-    Servo { ticks: u64, mean_ns: u32, p99_ns: u32, overruns: u32 },
+    Listening {
+        addr: SocketAddr,
+        fingerprint: String,
+        arm: &'a str,
+        joints: usize,
+        lag_s: f64,
+        radius_m: f64,
+    },
+    Connected {
+        epoch: u32,
+        peer: SocketAddr,
+    },
+    Disconnected {
+        why: &'a str,
+        received: u32,
+        dropped: u32,
+        clock_offset_s: Option<f64>,
+        clock_bound_s: Option<f64>,
+    },
+    Refused {
+        why: &'a str,
+    },
+    State {
+        state: String,
+        cause: String,
+        mono_ns: i64,
+    },
+    Engaged {
+        engagement: u32,
+        mono_ns: i64,
+        scale: f64,
+        rotation: [f64; 4],
+        hand_m: [f64; 3],
+        tip_m: [f64; 3],
+    },
+    Path {
+        knots: &'a [(f64, [f64; 3], [f64; 3])],
+    },
+    Servo {
+        ticks: u64,
+        mean_ns: u32,
+        p99_ns: u32,
+        overruns: u32,
+    },
 }
 
 /// Runs the daemon until it is told to stop.
@@ -101,7 +144,10 @@ enum Event<'a> {
 /// # Errors
 /// One line that says what to do.
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("no runtime")?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("no runtime")?;
     runtime.block_on(serve(args))
 }
 
@@ -111,14 +157,25 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         None => File::default(),
     };
     let identity = args.identity.clone().or(file.identity);
-    let identity = Identity::load_or_create(&identity.unwrap_or_else(|| cli::config_dir().join("robot.key")))?;
-    let peers = if args.peer.is_empty() { file.peers } else { args.peer.clone() };
-    let peers = peers.iter().map(|p| p.parse()).collect::<Result<Vec<Fingerprint>, _>>()?;
+    let identity =
+        Identity::load_or_create(&identity.unwrap_or_else(|| cli::config_dir().join("robot.key")))?;
+    let peers = if args.peer.is_empty() {
+        file.peers
+    } else {
+        args.peer.clone()
+    };
+    let peers = peers
+        .iter()
+        .map(|p| p.parse())
+        .collect::<Result<Vec<Fingerprint>, _>>()?;
     let mut fixed = file.fixed;
     fixed.extend(args.fixed.iter().cloned());
     let options = RigOptions {
         urdf: args.urdf.clone().or(file.urdf),
-        load: LoadOptions { tip: args.tip.clone().or(file.tip), fixed },
+        load: LoadOptions {
+            tip: args.tip.clone().or(file.tip),
+            fixed,
+        },
         start: args.start.clone().or(file.start),
         control: ControlConfig::default(),
         ..RigOptions::default()
@@ -127,10 +184,19 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     for notice in rig.arm.notices() {
         eprintln!("note: {notice}");
     }
-    let recorder = args.record.clone().or(file.record).map(|path| Recorder::start(&path, rig.arm.dof())).transpose()?;
-    let listen = args.listen.or(file.listen).unwrap_or_else(|| SocketAddr::from(([0, 0, 0, 0], 4433)));
-    let socket = quic::Socket::bind(listen)
-        .with_context(|| format!("cannot listen on {listen}: choose another --listen, or stop what uses it"))?;
+    let recorder = args
+        .record
+        .clone()
+        .or(file.record)
+        .map(|path| Recorder::start(&path, rig.arm.dof()))
+        .transpose()?;
+    let listen = args
+        .listen
+        .or(file.listen)
+        .unwrap_or_else(|| SocketAddr::from(([0, 0, 0, 0], 4433)));
+    let socket = quic::Socket::bind(listen).with_context(|| {
+        format!("cannot listen on {listen}: choose another --listen, or stop what uses it")
+    })?;
     if peers.is_empty() && !args.json {
         eprintln!("note: no --peer given: nobody will be let in");
     }
@@ -173,13 +239,21 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let (ticks, mean_ns, p99_ns, overruns) = running.timing.read();
     // The servo outlives everything that could still ask for motion; it ends at rest.
     drop(running);
-    log.say(&Event::Servo { ticks, mean_ns, p99_ns, overruns }, || {
-        format!(
-            "servo: {ticks} ticks, {:.1} µs mean, {:.1} µs p99, {overruns} late",
-            f64::from(mean_ns) * 1e-3,
-            f64::from(p99_ns) * 1e-3
-        )
-    });
+    log.say(
+        &Event::Servo {
+            ticks,
+            mean_ns,
+            p99_ns,
+            overruns,
+        },
+        || {
+            format!(
+                "servo: {ticks} ticks, {:.1} µs mean, {:.1} µs p99, {overruns} late",
+                f64::from(mean_ns) * 1e-3,
+                f64::from(p99_ns) * 1e-3
+            )
+        },
+    );
     match recorder {
         Some(recorder) => recorder.finish(),
         None => Ok(()),
@@ -187,7 +261,8 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
 }
 
 fn read_config(path: &Path) -> anyhow::Result<File> {
-    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let text =
+        std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
     toml::from_str(&text).map_err(|e| anyhow::anyhow!("{}: {e}", path.display()))
 }
 
@@ -220,9 +295,17 @@ async fn listen_to(
                 }
                 if transitions != Some(report.transitions) {
                     transitions = Some(report.transitions);
-                    let (state, cause) = (format!("{:?}", report.state), format!("{:?}", report.cause));
+                    let (state, cause) =
+                        (format!("{:?}", report.state), format!("{:?}", report.cause));
                     let text = format!("{state} ({cause})");
-                    log.say(&Event::State { state, cause, mono_ns: report.at.0 }, || text);
+                    log.say(
+                        &Event::State {
+                            state,
+                            cause,
+                            mono_ns: report.at.0,
+                        },
+                        || text,
+                    );
                 }
                 if report.engagement != engagement {
                     engagement = report.engagement;
@@ -233,9 +316,15 @@ async fn listen_to(
             }
             // Engagements count per session.
             Notice::Connected { epoch, peer } => {
-                log.say(&Event::Connected { epoch, peer }, || format!("operator {peer} (session {epoch})"));
+                log.say(&Event::Connected { epoch, peer }, || {
+                    format!("operator {peer} (session {epoch})")
+                });
             }
-            Notice::Disconnected { why, clock, counters } => {
+            Notice::Disconnected {
+                why,
+                clock,
+                counters,
+            } => {
                 let event = Event::Disconnected {
                     why: &why,
                     received: counters.received,
@@ -247,10 +336,15 @@ async fn listen_to(
                     let clock = clock.map_or_else(String::new, |(_, bound_s)| {
                         format!("; session clock known to ±{:.1} ms", bound_s * 1e3)
                     });
-                    format!("session ended: {why}; {} motions, {} dropped{clock}", counters.received, counters.dropped)
+                    format!(
+                        "session ended: {why}; {} motions, {} dropped{clock}",
+                        counters.received, counters.dropped
+                    )
                 });
             }
-            Notice::Refused { why } => log.say(&Event::Refused { why: &why }, || format!("refused {why}")),
+            Notice::Refused { why } => {
+                log.say(&Event::Refused { why: &why }, || format!("refused {why}"))
+            }
             Notice::Path(knots) if log.json => log.say(&Event::Path { knots: &knots }, String::new),
             Notice::Path(_) => {}
         }
@@ -283,7 +377,8 @@ struct Recorder {
 
 impl Recorder {
     fn start(path: &Path, dof: usize) -> anyhow::Result<Self> {
-        let file = std::fs::File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
+        let file = std::fs::File::create(path)
+            .with_context(|| format!("cannot write {}", path.display()))?;
         let (queue, reports) = sync_channel::<Report>(QUEUE);
         let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
             let mut out = std::io::BufWriter::new(file);
@@ -298,7 +393,12 @@ impl Recorder {
             }
             out.flush()
         })?;
-        Ok(Self { path: path.to_owned(), queue, thread, lost: 0 })
+        Ok(Self {
+            path: path.to_owned(),
+            queue,
+            thread,
+            lost: 0,
+        })
     }
 
     fn take(&mut self, report: &Report) {
@@ -308,14 +408,22 @@ impl Recorder {
     }
 
     fn finish(self) -> anyhow::Result<()> {
-        let Self { path, queue, thread, lost } = self;
+        let Self {
+            path,
+            queue,
+            thread,
+            lost,
+        } = self;
         drop(queue);
         match thread.join() {
             Ok(written) => written.with_context(|| format!("cannot write {}", path.display()))?,
             Err(_) => bail!("the recorder of {} failed", path.display()),
         }
         if lost > 0 {
-            eprintln!("note: {lost} ticks are missing in {}: the disk was too slow", path.display());
+            eprintln!(
+                "note: {lost} ticks are missing in {}: the disk was too slow",
+                path.display()
+            );
         }
         Ok(())
     }

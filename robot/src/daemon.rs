@@ -236,17 +236,16 @@ impl Daemon {
     }
 
     fn drain(&mut self, mut active: Option<&mut Active>, notices: &mpsc::UnboundedSender<Notice>) {
-        let timing = self.timing.as_deref().map_or_else(TickTiming::default, |timing| {
-            let (_, mean_ns, p99_ns, overruns) = timing.read();
-            TickTiming { mean_ns, p99_ns, overruns }
-        });
         let timing = self
             .timing
             .as_deref()
-            .map_or_else(TickTiming::default, |t| TickTiming {
-                mean_ns: t.mean_ns.load(Ordering::Relaxed),
-                p99_ns: t.p99_ns.load(Ordering::Relaxed),
-                overruns: t.overruns.load(Ordering::Relaxed),
+            .map_or_else(TickTiming::default, |timing| {
+                let (_, mean_ns, p99_ns, overruns) = timing.read();
+                TickTiming {
+                    mean_ns,
+                    p99_ns,
+                    overruns,
+                }
             });
         while let Ok(report) = self.servo.reports.pop() {
             if let Some(active) = active.as_deref_mut() {

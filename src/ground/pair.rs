@@ -161,12 +161,11 @@ impl Pair {
         let (tx, mut rx) = mpsc::unbounded_channel();
         let (words, words_rx) = mpsc::unbounded_channel();
         tokio::task::spawn_local(daemon.run(quit_rx, words_rx, tx));
-        let robot = Robot { reports: Rc::default(), notices: Rc::default(), quit, words };
-        tokio::task::spawn_local(daemon.run(quit_rx, tx));
         let robot = Robot {
             reports: Rc::default(),
             notices: Rc::default(),
             quit,
+            words,
         };
         let log = robot.clone();
         tokio::task::spawn_local(async move {

@@ -60,13 +60,17 @@ const MIXTURE: Params = Params {
 impl Adaptation {
     /// Starts from what was calibrated with the skill, or from the defaults.
     pub(super) fn new(gain: f64, skill: Option<&Skill>) -> Self {
-        let start = skill.map_or(Params::DEFAULT, |skill| skill.predictor().calibration().params);
+        let start = skill.map_or(Params::DEFAULT, |skill| {
+            skill.predictor().calibration().params
+        });
         let trust = start.trust.clamp(*PRIOR_TRUST.start(), *PRIOR_TRUST.end());
         Self {
             gain: gain.clamp(0.0, 1.0),
             ratio: (trust / (1.0 - trust)).sqrt(),
             damping: start.cv_damping,
-            rest_m: skill.map_or(0.0, |skill| REST * skill.stats().reach_m).max(1e-3),
+            rest_m: skill
+                .map_or(0.0, |skill| REST * skill.stats().reach_m)
+                .max(1e-3),
             pending: VecDeque::new(),
             mixture_error: 0.0,
             straight_error: 0.0,
@@ -86,7 +90,11 @@ impl Adaptation {
         let mixture = (self.mixture_error + prior).powi(2);
         let straight = (self.straight_error + self.ratio * prior).powi(2);
         let trust = self.moving(hand) * straight / (straight + mixture);
-        Params { gain: self.gain, trust, cv_damping: self.cv_damping() }
+        Params {
+            gain: self.gain,
+            trust,
+            cv_damping: self.cv_damping(),
+        }
     }
 
     fn cv_damping(&self) -> f64 {
@@ -96,25 +104,12 @@ impl Adaptation {
 
     /// From 0 for a hand at rest to 1 for one in motion.
     fn moving(&self, hand: &HandState) -> f64 {
-        let moved = hand.memory.iter().map(|m| (hand.x - m).norm_squared()).fold(0.0, f64::max);
+        let moved = hand
+            .memory
+            .iter()
+            .map(|m| (hand.x - m).norm_squared())
+            .fold(0.0, f64::max);
         moved / (moved + self.rest_m * self.rest_m)
-    /// Trust: weights ∝ (mean squared error)⁻² (prediction.md §3). Damping: the least-squares factor on
-    /// the velocity, drawn to ½ where nothing has moved yet.
-    pub(super) fn params(&self) -> Params {
-        let defaults = Params::default();
-        let Some(prior) = self.prior else {
-            return Params {
-                gain: self.gain,
-                ..defaults
-            };
-        };
-        let straight = (self.straight_error + PRIOR_RATIO * prior).powi(2);
-        let cv_damping = (self.along + 0.5 * prior) / (self.square + prior);
-        Params {
-            gain: self.gain,
-            trust: straight / (straight + mixture),
-            cv_damping: cv_damping.clamp(0.0, 1.0),
-        }
     }
 
     /// Judges what was predicted for the time up to `newest`, and predicts `horizon_s` ahead of it.
@@ -153,9 +148,11 @@ impl Adaptation {
     fn judge(&mut self, pending: &Pending, truth: Vector3<f64>) {
         let (run, moved) = (pending.straight - pending.origin, truth - pending.origin);
         let straight = pending.origin + run * self.cv_damping();
-        self.straight_error = MEMORY * self.straight_error + pending.weight * (straight - truth).norm_squared();
+        self.straight_error =
+            MEMORY * self.straight_error + pending.weight * (straight - truth).norm_squared();
         if let Some(mixture) = pending.mixture {
-            self.mixture_error = MEMORY * self.mixture_error + pending.weight * (mixture - truth).norm_squared();
+            self.mixture_error =
+                MEMORY * self.mixture_error + pending.weight * (mixture - truth).norm_squared();
         }
         self.along = MEMORY * self.along + run.dot(&moved);
         self.square = MEMORY * self.square + run.norm_squared();

@@ -64,11 +64,10 @@ impl Mirror {
     /// What an engage request carries.
     pub(super) fn reference(&self, skill: Option<&Skill>) -> Option<(WireState, u16, WireParams)> {
         let state = WireState::quantise(&self.hand)?;
-        Some((state, self.model(skill), WireParams::quantise(&self.adaptation.params(&self.hand))))
         Some((
             state,
             self.model(skill),
-            WireParams::quantise(&self.adaptation.params()),
+            WireParams::quantise(&self.adaptation.params(&self.hand)),
         ))
     }
 

@@ -375,10 +375,7 @@ impl Session {
             self.events.push_back(Event::Refused(Refusal::BadMapping));
             return;
         };
-        let Some((state, model, params)) = mirror.reference(skill)
-        let Some((state, model, params)) =
-            mirror.reference(self.skill.as_deref().filter(|_| self.model_stored))
-        else {
+        let Some((state, model, params)) = mirror.reference(skill) else {
             self.events
                 .push_back(Event::Refused(Refusal::StaleReference));
             return;

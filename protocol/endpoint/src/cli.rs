@@ -11,7 +11,11 @@ use tokio::sync::{mpsc, watch};
 
 /// The daemons' own folder: `$XDG_CONFIG_HOME/telemime`, else `$HOME/.config/telemime`, else here.
 pub fn config_dir() -> PathBuf {
-    let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    let set = |name: &str| {
+        std::env::var_os(name)
+            .filter(|v| !v.is_empty())
+            .map(PathBuf::from)
+    };
     set("XDG_CONFIG_HOME")
         .or_else(|| set("HOME").map(|home| home.join(".config")))
         .unwrap_or_default()
@@ -23,11 +27,15 @@ pub fn config_dir() -> PathBuf {
 /// # Errors
 /// One line that says what to write instead.
 pub fn resolve(text: &str) -> Result<SocketAddr, String> {
-    let found = text.to_socket_addrs().map_err(|e| format!("`{text}`: {e}; write host:port, for example 192.168.1.20:4433"))?;
+    let found = text
+        .to_socket_addrs()
+        .map_err(|e| format!("`{text}`: {e}; write host:port, for example 192.168.1.20:4433"))?;
     let found: Vec<_> = found.collect();
     // An IPv4 address first: that is what the endpoint's socket is bound for by default.
     let first = found.iter().find(|a| a.is_ipv4()).or(found.first());
-    first.copied().ok_or_else(|| format!("`{text}` has no address"))
+    first
+        .copied()
+        .ok_or_else(|| format!("`{text}` has no address"))
 }
 
 /// Prints `event` as one line of JSON on stdout. A reader that has gone away is not our concern.
@@ -52,11 +60,15 @@ pub enum Word {
 ///
 /// # Errors
 /// The system's, if signals cannot be caught.
-pub fn listen(follow_stdin: bool) -> io::Result<(watch::Receiver<bool>, mpsc::UnboundedReceiver<Word>)> {
+pub fn listen(
+    follow_stdin: bool,
+) -> io::Result<(watch::Receiver<bool>, mpsc::UnboundedReceiver<Word>)> {
     let (quit_tx, quit) = watch::channel(false);
     let (word_tx, words) = mpsc::unbounded_channel();
-    let (mut interrupt, mut terminate) =
-        (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let (mut interrupt, mut terminate) = (
+        signal(SignalKind::interrupt())?,
+        signal(SignalKind::terminate())?,
+    );
     let by_signal = quit_tx.clone();
     tokio::spawn(async move {
         tokio::select! {

@@ -32,7 +32,12 @@ impl Timing {
     /// Ticks, mean and 99th percentile (ns), overruns.
     pub fn read(&self) -> (u64, u32, u32, u32) {
         let get = |value: &AtomicU32| value.load(Ordering::Relaxed);
-        (self.ticks.load(Ordering::Relaxed), get(&self.mean_ns), get(&self.p99_ns), get(&self.overruns))
+        (
+            self.ticks.load(Ordering::Relaxed),
+            get(&self.mean_ns),
+            get(&self.p99_ns),
+            get(&self.overruns),
+        )
     }
 }
 
