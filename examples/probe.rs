@@ -163,7 +163,7 @@ fn main() {
             },
             rmse_m(&offline(true, 0.0).tip, &truth, &grid),
             rmse_m(&offline(false, 0.0).tip, &truth, &grid),
-            summary.engaged.motion.bytes as f64 / (44.0 * samples.len() as f64),
+            summary.engaged.motion.bytes as f64 / (44.0 * summary.counters.samples as f64),
             summary.counters.messages as f64 / (end + 1.3),
         ];
         println!(

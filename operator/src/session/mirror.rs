@@ -26,11 +26,24 @@ const KEYFRAME: u32 = 8;
 /// A future bound below this makes no sense: the state itself is quantised, m.
 const LEAST_FUTURE_BOUND_M: f64 = 1e-3;
 
+/// Every knot travels in this many messages at once, so that a lost packet costs no round trip …
+const COPIES: u8 = 2;
+
+/// … and again when it is still not acknowledged after the round trip and this long, s.
+const PATIENCE_S: f64 = 0.15;
+
+/// A knot the robot may not have yet.
+struct Unacknowledged {
+    knot: PathKnot,
+    copies: u8,
+    sent: Stamp,
+}
+
 /// A live engagement.
 pub(super) struct Mirror {
     hand: HandState,
     path: PathEncoder,
-    unacknowledged: VecDeque<PathKnot>,
+    unacknowledged: VecDeque<Unacknowledged>,
     first_unacknowledged: u32,
     adaptation: Adaptation,
     without_model: bool,
@@ -105,7 +118,8 @@ impl Mirror {
             self.unacknowledged.pop_front();
             self.first_unacknowledged += 1;
         }
-        self.unacknowledged.push_back(knot);
+        let unsent = Unacknowledged { knot, copies: 0, sent: hand.t };
+        self.unacknowledged.push_back(unsent);
         true
     }
 
@@ -126,30 +140,39 @@ impl Mirror {
     }
 
     /// The next message but for its envelope; `None` if the hand is nowhere that can be sent.
-    pub(super) fn motion(&mut self, skill: Option<&Skill>) -> Option<Motion> {
+    pub(super) fn motion(&mut self, skill: Option<&Skill>, now: Stamp, delay_s: f64) -> Option<Motion> {
         let skill = skill.filter(|_| !self.without_model);
         let state = WireState::quantise(&self.hand)?;
+        let params = WireParams::quantise(&self.adaptation.params(&self.hand));
         self.messages += 1;
         let forecast = self.predict(skill)?;
         self.sent = Some(forecast);
-        let due: Vec<_> = self
-            .unacknowledged
-            .iter()
-            .take(KNOTS_PER_MESSAGE)
-            .copied()
-            .collect();
+        let (first_knot, due) = self.due_knots(now, delay_s);
         Some(Motion {
             epoch: 0,
             engagement: 0,
             seq: 0,
             lease_ms: 0,
             model: self.model(skill),
-            params: WireParams::quantise(&self.adaptation.params(&self.hand)),
+            params,
             checksum: (self.messages % KEYFRAME == 1).then(|| forecast.checksum()),
             state,
-            first_knot: self.first_unacknowledged,
+            first_knot,
             knots: knots::pack(&state, self.path.grid(), &due).unwrap_or_default(),
         })
+    }
+
+    /// The knots for a message sent now, without a gap, and the number of the first.
+    fn due_knots(&mut self, now: Stamp, delay_s: f64) -> (u32, Vec<PathKnot>) {
+        let overdue = |u: &Unacknowledged| now.secs_since(u.sent) > 2.0 * delay_s + PATIENCE_S;
+        let start = self.unacknowledged.iter().position(|u| u.copies < COPIES || overdue(u));
+        let start = start.unwrap_or(self.unacknowledged.len());
+        let due = self.unacknowledged.iter_mut().skip(start).take(KNOTS_PER_MESSAGE).map(|u| {
+            u.copies = u.copies.saturating_add(1);
+            u.sent = now;
+            u.knot
+        });
+        (self.first_unacknowledged + start as u32, due.collect())
     }
 
     fn model(&self, skill: Option<&Skill>) -> u16 {

@@ -60,7 +60,7 @@ impl Default for SessionConfig {
     fn default() -> Self {
         Self {
             max_silence_s: 0.2,
-            lease_s: 0.45,
+            lease_s: 0.65,
             future_bound: FutureBound::Relative(0.6),
             path_bound_m: None,
             gain: 1.0,
@@ -489,7 +489,7 @@ impl Session {
             },
             Activity::Mirror(mirror) => {
                 let skill = self.skill.as_deref().filter(|_| self.model_stored);
-                let Some(mut motion) = mirror.motion(skill) else {
+                let Some(mut motion) = mirror.motion(skill, now, self.delay_s) else {
                     return;
                 };
                 motion.epoch = self.epoch;
