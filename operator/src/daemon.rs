@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use quinn::{Connection, Endpoint, SendStream, VarInt};
+use telemime_endpoint::cli::Word;
 use telemime_endpoint::control::{Control, ControlError, write_frame};
 use telemime_endpoint::meter::Counts;
 use telemime_endpoint::{HostClock, Meter, Mono, quic};
@@ -106,6 +107,8 @@ pub enum Notice {
     },
     /// Something happened in the session, at this time of the session clock.
     Event(Stamp, Event),
+    /// How far the task has got, in [0, 1]; a few times a second.
+    Progress(f64),
     /// The scale the next engagement uses, and ε_path, m.
     Mapping {
         /// Tip metres per hand metre.
@@ -144,6 +147,7 @@ impl Daemon {
         &self,
         task: &mut Task,
         mut quit: watch::Receiver<bool>,
+        mut words: mpsc::UnboundedReceiver<Word>,
         notices: &mpsc::UnboundedSender<Notice>,
     ) -> Result<Summary, DaemonError> {
         let mut summary = Summary {
@@ -165,7 +169,15 @@ impl Daemon {
             let _ = notices.send(Notice::Connected { epoch: link.epoch });
             let mut session = Session::new(self.config, self.skill.clone(), link.epoch);
             let end = self
-                .drive(&mut session, link, task, &mut quit, notices, &mut marks)
+                .drive(
+                    &mut session,
+                    link,
+                    task,
+                    &mut quit,
+                    &mut words,
+                    notices,
+                    &mut marks,
+                )
                 .await;
             summary.counters.add(session.counters());
             match end {
@@ -278,6 +290,7 @@ impl Daemon {
         mut link: Link,
         task: &mut Task,
         quit: &mut watch::Receiver<bool>,
+        words: &mut mpsc::UnboundedReceiver<Word>,
         notices: &mpsc::UnboundedSender<Notice>,
         marks: &mut Marks,
     ) -> End {
@@ -310,6 +323,10 @@ impl Daemon {
                 marks.released = Some(self.meter.counts());
                 return self.leave(session, link).await;
             }
+            if (task.progress() - marks.progress).abs() >= 0.01 {
+                marks.progress = task.progress();
+                let _ = notices.send(Notice::Progress(marks.progress));
+            }
             if task.has_released() {
                 marks.released.get_or_insert(self.meter.counts());
             }
@@ -327,6 +344,10 @@ impl Daemon {
                     let _ = self.leave(session, link).await;
                     return End::Quit;
                 }
+                Some(word) = words.recv() => match word {
+                    Word::Stop => session.stop(self.now()),
+                    Word::Reset => session.reset(),
+                },
                 frame = link.frames.recv() => match frame {
                     Some(Ok(frame)) => {
                         if let Err(e) = session.handle_control(self.now(), &frame) {
@@ -386,6 +407,7 @@ fn malformed(connection: &Connection, error: &DecodeError) -> String {
 struct Marks {
     engaged: Option<Counts>,
     released: Option<Counts>,
+    progress: f64,
 }
 
 impl Marks {

@@ -1,6 +1,27 @@
 //! Recorded demonstrations: `t,x,y,z` CSV, one file each; a folder is a skill.
 
 mod error;
+
+/// Whether `name` matches `pattern`, in which `*` stands for any text.
+fn matches(pattern: &str, name: &str) -> bool {
+    let Some((head, rest)) = pattern.split_once('*') else {
+        return pattern == name;
+    };
+    let Some(mut tail) = name.strip_prefix(head) else {
+        return false;
+    };
+    loop {
+        if matches(rest, tail) {
+            return true;
+        }
+        let mut chars = tail.chars();
+        if chars.next().is_none() {
+            return false;
+        }
+        tail = chars.as_str();
+    }
+}
+
 #[cfg(test)]
 mod tests;
 
@@ -225,11 +246,15 @@ pub struct Demonstrations {
 }
 
 impl Demonstrations {
-    /// Reads every `*.csv` of a folder, by name.
+    /// Reads every `*.csv` of a folder, by name; with a `pattern`, those whose name without the ending
+    /// matches it (`*` stands for anything).
     ///
     /// # Errors
     /// [`DemonstrationError`]: of any of the files, or of the folder.
-    pub fn read_dir(dir: impl AsRef<Path>) -> Result<Self, DemonstrationError> {
+    pub fn read_dir(
+        dir: impl AsRef<Path>,
+        pattern: Option<&str>,
+    ) -> Result<Self, DemonstrationError> {
         let dir = dir.as_ref();
         let io = |source| DemonstrationError::Io {
             path: dir.to_owned(),
@@ -256,6 +281,13 @@ impl Demonstrations {
             }
         }
         paths.sort();
+        if let Some(pattern) = pattern {
+            let name = |p: &PathBuf| {
+                p.file_stem()
+                    .is_some_and(|n| matches(pattern, &n.to_string_lossy()))
+            };
+            paths.retain(name);
+        }
         let demonstrations = paths
             .iter()
             .map(Demonstration::read_csv)

@@ -1,6 +1,7 @@
 //! The operator daemon: learns skills from demonstrations, follows the hand, and speaks to the robot
 //! only when the robot's own prediction would go wrong.
 
+pub mod cli;
 pub mod daemon;
 pub mod demonstration;
 pub mod learn;

@@ -86,6 +86,7 @@ pub struct Operator {
     /// What it notices.
     pub notices: mpsc::UnboundedReceiver<OperatorNotice>,
     quit: watch::Sender<bool>,
+    words: mpsc::UnboundedSender<Word>,
 }
 
 impl Robot {
@@ -112,6 +113,12 @@ impl Robot {
 }
 
 impl Operator {
+    /// A word at the operator's own terminal.
+    pub fn say(&self, word: Word) {
+        // The daemon has ended if nobody hears it.
+        let _ = self.words.send(word);
+    }
+
     /// Stops the daemon, as Ctrl-C does.
     pub fn quit(&self) {
         self.quit.send_replace(true);
@@ -261,15 +268,17 @@ impl Pair {
             patience: Duration::from_secs(5),
         };
         let (quit, quit_rx) = watch::channel(false);
+        let (words, words_rx) = mpsc::unbounded_channel();
         let (tx, notices) = mpsc::unbounded_channel();
         let done = tokio::task::spawn_local(async move {
-            let result = daemon.run(&mut task, quit_rx, &tx).await;
+            let result = daemon.run(&mut task, quit_rx, words_rx, &tx).await;
             (result, task)
         });
         Ok(Operator {
             done,
             notices,
             quit,
+            words,
         })
     }
 

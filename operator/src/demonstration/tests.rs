@@ -88,19 +88,19 @@ fn a_folder_is_a_skill() {
     let root = tempfile::tempdir().unwrap();
     let dir = root.path().join("wave");
     assert!(matches!(
-        Demonstrations::read_dir(&dir),
+        Demonstrations::read_dir(&dir, None),
         Err(DemonstrationError::Io { .. })
     ));
     fs::create_dir(&dir).unwrap();
     fs::write(dir.join("readme.txt"), "not a demonstration").unwrap();
     assert!(matches!(
-        Demonstrations::read_dir(&dir),
+        Demonstrations::read_dir(&dir, None),
         Err(DemonstrationError::NoDemonstrations { .. })
     ));
     let text = good("t,x,y,z", |i| format!("{i},1,2,3")).join("\n");
     fs::write(dir.join("b.csv"), &text).unwrap();
     fs::write(dir.join("a.csv"), &text).unwrap();
-    let skill = Demonstrations::read_dir(&dir).unwrap();
+    let skill = Demonstrations::read_dir(&dir, None).unwrap();
     assert_eq!(skill.name, "wave");
     let names: Vec<_> = skill
         .demonstrations
@@ -116,7 +116,7 @@ fn a_folder_is_a_skill() {
     let wider = good("t,x,y,z,qw", |i| format!("{i},1,2,3,1")).join("\n");
     fs::write(dir.join("c.csv"), wider).unwrap();
     assert!(matches!(
-        Demonstrations::read_dir(&dir),
+        Demonstrations::read_dir(&dir, None),
         Err(DemonstrationError::Shape { .. })
     ));
 }
@@ -150,4 +150,12 @@ proptest::proptest! {
         let _ = Demonstration::parse("a.csv", text.as_bytes());
         let _ = Demonstration::parse("a.csv", &bytes);
     }
+}
+
+#[test]
+fn a_pattern_picks_files_by_name() {
+    let matching = |pattern: &str, name: &str| super::matches(pattern, name);
+    assert!(matching("a3_s2_*", "a3_s2_t1") && !matching("a3_s2_*", "a3_s21_t1"));
+    assert!(matching("*", "") && matching("*t1", "a3_s2_t1") && matching("a*s2*", "a3_s2_t1"));
+    assert!(!matching("a", "ab") && !matching("*x*", "abc"));
 }

@@ -118,7 +118,11 @@ impl Mirror {
             self.unacknowledged.pop_front();
             self.first_unacknowledged += 1;
         }
-        let unsent = Unacknowledged { knot, copies: 0, sent: hand.t };
+        let unsent = Unacknowledged {
+            knot,
+            copies: 0,
+            sent: hand.t,
+        };
         self.unacknowledged.push_back(unsent);
         true
     }
@@ -140,7 +144,12 @@ impl Mirror {
     }
 
     /// The next message but for its envelope; `None` if the hand is nowhere that can be sent.
-    pub(super) fn motion(&mut self, skill: Option<&Skill>, now: Stamp, delay_s: f64) -> Option<Motion> {
+    pub(super) fn motion(
+        &mut self,
+        skill: Option<&Skill>,
+        now: Stamp,
+        delay_s: f64,
+    ) -> Option<Motion> {
         let skill = skill.filter(|_| !self.without_model);
         let state = WireState::quantise(&self.hand)?;
         let params = WireParams::quantise(&self.adaptation.params(&self.hand));
@@ -165,13 +174,21 @@ impl Mirror {
     /// The knots for a message sent now, without a gap, and the number of the first.
     fn due_knots(&mut self, now: Stamp, delay_s: f64) -> (u32, Vec<PathKnot>) {
         let overdue = |u: &Unacknowledged| now.secs_since(u.sent) > 2.0 * delay_s + PATIENCE_S;
-        let start = self.unacknowledged.iter().position(|u| u.copies < COPIES || overdue(u));
+        let start = self
+            .unacknowledged
+            .iter()
+            .position(|u| u.copies < COPIES || overdue(u));
         let start = start.unwrap_or(self.unacknowledged.len());
-        let due = self.unacknowledged.iter_mut().skip(start).take(KNOTS_PER_MESSAGE).map(|u| {
-            u.copies = u.copies.saturating_add(1);
-            u.sent = now;
-            u.knot
-        });
+        let due = self
+            .unacknowledged
+            .iter_mut()
+            .skip(start)
+            .take(KNOTS_PER_MESSAGE)
+            .map(|u| {
+                u.copies = u.copies.saturating_add(1);
+                u.sent = now;
+                u.knot
+            });
         (self.first_unacknowledged + start as u32, due.collect())
     }
 

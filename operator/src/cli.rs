@@ -1,0 +1,429 @@
+//! The operator daemon's command line: flags over a TOML file over defaults.
+
+mod report;
+mod skills;
+
+use std::io::IsTerminal;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
+use serde::Deserialize;
+use telemime_endpoint::cli;
+use telemime_endpoint::{Fingerprint, HostClock, Identity, Meter, Mono, quic};
+use tokio::sync::mpsc;
+
+use crate::daemon::Daemon;
+use crate::session::{FutureBound, SessionConfig};
+use crate::task::{Outcome, Recording, Task};
+pub use report::{Event, PlayReport};
+pub use skills::{Skills, infer};
+
+/// Teach, drive and play a robot.
+///
+/// Replays a recording as if the hand were there (--replay), or plays a learned skill (--play). The operator
+/// makes its key at the first start and prints its fingerprint; give that to the robot with --peer, and the
+/// robot's to the operator. On the terminal, type stop (emergency stop), reset or quit.
+#[derive(clap::Args, Debug, Clone, Default)]
+pub struct Args {
+    /// Read settings from this TOML file; flags override it.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// The robot.
+    #[arg(long, value_name = "HOST:PORT")]
+    pub connect: Option<String>,
+    /// This operator's private key, made if missing [default: ~/.config/telemime/operator.key].
+    #[arg(long, value_name = "FILE")]
+    pub identity: Option<PathBuf>,
+    /// The robot's fingerprint.
+    #[arg(long, value_name = "FINGERPRINT")]
+    pub peer: Option<String>,
+    /// Learn a skill from this folder of demonstrations (CSV: t,x,y,z) at the start; may be repeated.
+    #[arg(long, value_name = "DIR")]
+    pub learn: Vec<PathBuf>,
+    /// Of those folders, only the files whose names match this pattern (* stands for anything).
+    #[arg(long = "match", value_name = "PATTERN")]
+    pub matching: Option<String>,
+    /// Load a skill that `telemime learn` saved; may be repeated.
+    #[arg(long, value_name = "FILE")]
+    pub skill: Vec<PathBuf>,
+    /// Replay this recording (CSV: t,x,y,z) in real time, mirrored by the robot.
+    #[arg(long, value_name = "FILE", conflicts_with = "play")]
+    pub replay: Option<PathBuf>,
+    /// Play this skill: its inferred motion, compressed to checkpoints.
+    #[arg(long, value_name = "SKILL")]
+    pub play: Option<String>,
+    /// Play: largest error of the rebuilt motion, m [default: 1 % of the skill's reach].
+    #[arg(long, value_name = "M")]
+    pub bound: Option<f64>,
+    /// Tip metres per hand metre [default: from the demonstrations and the arm's limits].
+    #[arg(long)]
+    pub scale: Option<f64>,
+    /// The hand's axes [default: kinect].
+    #[arg(long, value_enum)]
+    pub axes: Option<Axes>,
+    /// Prediction gain, 0 (none) to 1.
+    #[arg(long)]
+    pub gain: Option<f64>,
+    /// ε_future: when the robot's prediction would be off by more, the operator speaks; a length (40mm, 0.04m) or a
+    /// multiple of the predicted deviation (0.6sigma) [default: 0.6sigma].
+    #[arg(long, value_name = "BOUND", value_parser = parse_future_bound)]
+    pub future_bound: Option<FutureBound>,
+    /// ε_path, m: the robot's record of the path is that exact [default: 2 % of the skill's reach].
+    #[arg(long, value_name = "M")]
+    pub path_bound: Option<f64>,
+    /// The operator speaks at least this often, s [default: 0.2].
+    #[arg(long, value_name = "S")]
+    pub max_silence: Option<f64>,
+    /// Each message authorises motion for this long, s [default: 0.65].
+    #[arg(long, value_name = "S")]
+    pub lease: Option<f64>,
+    /// Replay: rest at the first position for this long, s [default: 1].
+    #[arg(long, value_name = "S")]
+    pub rest: Option<f64>,
+    /// Give up if the robot is not reached within this time, s [default: 10].
+    #[arg(long, value_name = "S")]
+    pub patience: Option<f64>,
+    /// Seed of learning.
+    #[arg(long)]
+    pub seed: Option<u64>,
+    /// Print events as JSON lines on stdout.
+    #[arg(long)]
+    pub json: bool,
+    /// Stop when stdin ends: for a parent process that must not leave orphans.
+    #[arg(long, hide = true)]
+    pub follow_stdin: bool,
+}
+
+/// How the tracker's axes lie to the robot's (x forward, y left, z up).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Axes {
+    /// The operator faces the sensor: x to the operator's right, y up, z away from the sensor.
+    #[default]
+    Kinect,
+    /// The same axes as the robot's.
+    Base,
+}
+
+impl Axes {
+    /// The rotation from hand axes to base axes.
+    pub fn rotation(self) -> UnitQuaternion<f64> {
+        match self {
+            Self::Base => UnitQuaternion::identity(),
+            // Towards the sensor is forward, the operator's left is left, up is up.
+            Self::Kinect => {
+                let rows = Matrix3::new(0.0, 0.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, 0.0);
+                UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rows))
+            }
+        }
+    }
+}
+
+fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
+    let wrong = || {
+        format!("`{text}`: write a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)")
+    };
+    let number = |digits: &str| {
+        digits
+            .trim()
+            .parse::<f64>()
+            .ok()
+            .filter(|v| v.is_finite() && *v >= 0.0)
+            .ok_or_else(wrong)
+    };
+    if let Some(digits) = text.strip_suffix("sigma") {
+        Ok(FutureBound::Relative(number(digits)?))
+    } else if let Some(digits) = text.strip_suffix("mm") {
+        Ok(FutureBound::Absolute(number(digits)? * 1e-3))
+    } else if let Some(digits) = text.strip_suffix('m') {
+        Ok(FutureBound::Absolute(number(digits)?))
+    } else {
+        Err(wrong())
+    }
+}
+
+/// The TOML file; every key may be left out.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    connect: Option<String>,
+    identity: Option<PathBuf>,
+    peer: Option<String>,
+    #[serde(default)]
+    learn: Vec<PathBuf>,
+    #[serde(rename = "match")]
+    matching: Option<String>,
+    #[serde(default)]
+    skills: Vec<PathBuf>,
+    replay: Option<PathBuf>,
+    play: Option<String>,
+    bound_m: Option<f64>,
+    scale: Option<f64>,
+    axes: Option<Axes>,
+    gain: Option<f64>,
+    future_bound: Option<String>,
+    path_bound_m: Option<f64>,
+    max_silence_s: Option<f64>,
+    lease_s: Option<f64>,
+    rest_s: Option<f64>,
+    patience_s: Option<f64>,
+    seed: Option<u64>,
+}
+
+fn read_config(path: &Path) -> anyhow::Result<File> {
+    let text =
+        std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    toml::from_str(&text).map_err(|e| anyhow::anyhow!("{}: {e}", path.display()))
+}
+
+impl Args {
+    /// These flags over the file they name.
+    fn merged(mut self) -> anyhow::Result<Self> {
+        let Some(path) = self.config.clone() else {
+            return Ok(self);
+        };
+        let file = read_config(&path)?;
+        let bound = file
+            .future_bound
+            .as_deref()
+            .map(parse_future_bound)
+            .transpose();
+        let bound = bound.map_err(|e| anyhow::anyhow!("{}: future_bound = {e}", path.display()))?;
+        self.connect = self.connect.or(file.connect);
+        self.identity = self.identity.or(file.identity);
+        self.peer = self.peer.or(file.peer);
+        if self.learn.is_empty() && self.skill.is_empty() {
+            (self.learn, self.skill) = (file.learn, file.skills);
+        }
+        self.matching = self.matching.or(file.matching);
+        if self.replay.is_none() && self.play.is_none() {
+            (self.replay, self.play) = (file.replay, file.play);
+        }
+        self.bound = self.bound.or(file.bound_m);
+        self.scale = self.scale.or(file.scale);
+        self.axes = self.axes.or(file.axes);
+        self.gain = self.gain.or(file.gain);
+        self.future_bound = self.future_bound.or(bound);
+        self.path_bound = self.path_bound.or(file.path_bound_m);
+        self.max_silence = self.max_silence.or(file.max_silence_s);
+        self.lease = self.lease.or(file.lease_s);
+        self.rest = self.rest.or(file.rest_s);
+        self.patience = self.patience.or(file.patience_s);
+        self.seed = self.seed.or(file.seed);
+        Ok(self)
+    }
+
+    fn session(&self) -> anyhow::Result<SessionConfig> {
+        let defaults = SessionConfig::default();
+        let config = SessionConfig {
+            max_silence_s: self.max_silence.unwrap_or(defaults.max_silence_s),
+            lease_s: self.lease.unwrap_or(defaults.lease_s),
+            future_bound: self.future_bound.unwrap_or(defaults.future_bound),
+            path_bound_m: self.path_bound,
+            gain: self.gain.unwrap_or(defaults.gain),
+            scale: self.scale,
+            rotation: self.axes.unwrap_or_default().rotation(),
+        };
+        let within = |name: &str, value: f64, low: f64, high: f64| -> anyhow::Result<()> {
+            if !(value > low && value <= high) {
+                bail!("{name} is {value}: it must be above {low} and at most {high}");
+            }
+            Ok(())
+        };
+        within("--max-silence", config.max_silence_s, 0.005, 5.0)?;
+        within("--lease", config.lease_s, config.max_silence_s, 10.0)?;
+        within("--gain", config.gain, -f64::EPSILON, 1.0)?;
+        if let Some(scale) = config.scale {
+            within("--scale", scale, 0.0, 10.0)?;
+        }
+        if let Some(bound_m) = config.path_bound_m {
+            within("--path-bound", bound_m, 0.0, 10.0)?;
+        }
+        Ok(config)
+    }
+}
+
+/// Runs the daemon until its task is done.
+///
+/// # Errors
+/// One line that says what to do; also if the task was interrupted.
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("no runtime")?;
+    runtime.block_on(operate(args.clone().merged()?))
+}
+
+async fn operate(args: Args) -> anyhow::Result<()> {
+    let config = args.session()?;
+    let Some(connect) = &args.connect else {
+        bail!("which robot? Give --connect HOST:PORT (or connect = \"…\" in the configuration)");
+    };
+    let robot: SocketAddr = cli::resolve(connect).map_err(anyhow::Error::msg)?;
+    let key = args
+        .identity
+        .clone()
+        .unwrap_or_else(|| cli::config_dir().join("operator.key"));
+    let identity = Identity::load_or_create(&key)?;
+    let log = report::Log { json: args.json };
+    log.say(&Event::Fingerprint {
+        fingerprint: identity.fingerprint().to_string(),
+    });
+    let Some(peer) = &args.peer else {
+        bail!(
+            "whose robot? Give its fingerprint with --peer; ours is {} (for the robot's --peer)",
+            identity.fingerprint()
+        );
+    };
+    let peer: Fingerprint = peer.parse()?;
+    let skills = Skills::gather(&args, &log)?;
+    let (mut task, play) = make_task(&args, &skills)?;
+    if let Some(play) = play {
+        log.say(&Event::Plan(play));
+    }
+
+    let (quit, words) = cli::listen(args.follow_stdin)?;
+    let meter = Meter::default();
+    let local = SocketAddr::from(if robot.is_ipv4() {
+        (std::net::IpAddr::from([0; 4]), 0)
+    } else {
+        (std::net::IpAddr::from([0; 16]), 0)
+    });
+    let endpoint = quic::client(&identity, peer, quic::Socket::bind(local)?, &meter)?;
+    let clock = HostClock::new();
+    let daemon = Daemon {
+        endpoint,
+        meter,
+        robot,
+        clock,
+        // A second before now, so that a sensor's latency may be subtracted from the first sample.
+        epoch: Mono(clock.now().0 - 1_000_000_000),
+        skill: skills.mirror(),
+        config,
+        patience: Duration::from_secs_f64(args.patience.unwrap_or(10.0).clamp(0.1, 3600.0)),
+    };
+    let (notices, heard) = mpsc::unbounded_channel();
+    let epoch = daemon.epoch;
+    let progress = std::io::stderr().is_terminal() && !args.json;
+    let listener = tokio::spawn(report::listen_to(heard, log, epoch, progress));
+    let done = daemon.run(&mut task, quit, words, &notices).await;
+    drop(notices);
+    listener.await.context("the log ended early")?;
+    let summary = done?;
+    log.say(&Event::done(&summary, &task, epoch));
+    match summary.outcome {
+        Outcome::Completed => Ok(()),
+        Outcome::Interrupted(why) => bail!("{why}"),
+    }
+}
+
+fn make_task(args: &Args, skills: &Skills) -> anyhow::Result<(Task, Option<PlayReport>)> {
+    match (&args.replay, &args.play) {
+        (Some(path), None) => {
+            let recording = skills.unseen(path)?;
+            let samples = recording
+                .samples()
+                .iter()
+                .map(|s| (s.t_s, s.position))
+                .collect();
+            let rest_s = args.rest.unwrap_or(1.0).clamp(0.0, 60.0);
+            Ok((Task::replay(Recording { samples, rest_s }), None))
+        }
+        (None, Some(name)) => {
+            let skill = skills.named(name)?;
+            let bound_m = args.bound.unwrap_or(0.01 * skill.stats().reach_m);
+            let (plan, report) = infer(&skill, bound_m)?;
+            Ok((Task::play(plan), Some(report)))
+        }
+        _ => bail!("what to do? Give --replay FILE or --play SKILL"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector3;
+
+    #[test]
+    fn a_kinect_hand_moving_towards_the_sensor_moves_the_tip_forward() {
+        let rotation = Axes::Kinect.rotation();
+        let to = |x, y, z| rotation * Vector3::new(x, y, z);
+        assert!((to(0.0, 0.0, -1.0) - Vector3::x()).norm() < 1e-12);
+        assert!((to(-1.0, 0.0, 0.0) - Vector3::y()).norm() < 1e-12);
+        assert!((to(0.0, 1.0, 0.0) - Vector3::z()).norm() < 1e-12);
+    }
+
+    #[test]
+    fn bounds_are_lengths_or_multiples() {
+        assert_eq!(parse_future_bound("40mm"), Ok(FutureBound::Absolute(0.04)));
+        assert_eq!(parse_future_bound("0.04m"), Ok(FutureBound::Absolute(0.04)));
+        assert_eq!(
+            parse_future_bound("0.6sigma"),
+            Ok(FutureBound::Relative(0.6))
+        );
+        for bad in ["", "40", "mm", "-1mm", "nanmm", "infsigma"] {
+            assert!(parse_future_bound(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn flags_override_the_file_and_unknown_keys_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("operator.toml");
+        std::fs::write(
+            &path,
+            "connect = \"robot:4433\"\nscale = 0.2\nfuture_bound = \"40mm\"\n",
+        )
+        .unwrap();
+        let args = Args {
+            config: Some(path.clone()),
+            scale: Some(0.1),
+            ..Args::default()
+        };
+        let merged = args.clone().merged().unwrap();
+        assert_eq!(
+            (merged.connect.as_deref(), merged.scale),
+            (Some("robot:4433"), Some(0.1))
+        );
+        assert_eq!(
+            merged.session().unwrap().future_bound,
+            FutureBound::Absolute(0.04)
+        );
+        std::fs::write(&path, "conect = \"robot:4433\"\n").unwrap();
+        let error = args.merged().unwrap_err().to_string();
+        assert!(
+            error.contains("conect") && error.contains("operator.toml"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn impossible_settings_are_refused_by_name() {
+        let refused = |args: Args| args.session().unwrap_err().to_string();
+        assert!(
+            refused(Args {
+                lease: Some(0.1),
+                ..Args::default()
+            })
+            .contains("--lease")
+        );
+        assert!(
+            refused(Args {
+                gain: Some(1.5),
+                ..Args::default()
+            })
+            .contains("--gain")
+        );
+        assert!(
+            refused(Args {
+                scale: Some(f64::NAN),
+                ..Args::default()
+            })
+            .contains("--scale")
+        );
+    }
+}

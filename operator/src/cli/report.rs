@@ -1,0 +1,323 @@
+//! What the operator tells: lines for people, JSON lines for machines.
+
+use indicatif::{ProgressBar, ProgressStyle};
+use nalgebra::Vector3;
+use serde::Serialize;
+use telemime_endpoint::Mono;
+use telemime_endpoint::cli::emit;
+use telemime_endpoint::meter::Counts;
+use tokio::sync::mpsc;
+
+use crate::daemon::{Notice, Summary};
+use crate::session;
+use crate::task::{Outcome, Task};
+
+/// How well one series follows another: mean absolute and squared error, and R² of the worst axis.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Scores {
+    /// Mean absolute error over all axes, m.
+    pub mae_m: f64,
+    /// Mean squared error over all axes, m².
+    pub mse_m2: f64,
+    /// Coefficient of determination, the lowest of the three axes; an axis without motion does not count.
+    pub r2: f64,
+    /// Largest distance, m.
+    pub max_m: f64,
+}
+
+impl Scores {
+    /// Of `estimate` against `truth`, sample by sample; both have the same length.
+    pub fn of(truth: &[Vector3<f64>], estimate: &[Vector3<f64>]) -> Self {
+        let n = truth.len().max(1) as f64;
+        let errors: Vec<_> = truth.iter().zip(estimate).map(|(a, b)| a - b).collect();
+        let mean = truth.iter().sum::<Vector3<f64>>() / n;
+        let r2 = |axis: usize| {
+            let total: f64 = truth.iter().map(|x| (x[axis] - mean[axis]).powi(2)).sum();
+            let rest: f64 = errors.iter().map(|e| e[axis].powi(2)).sum();
+            // A motion of less than a tenth of a millimetre is none.
+            if total / n > 1e-8 {
+                1.0 - rest / total
+            } else {
+                1.0
+            }
+        };
+        Self {
+            mae_m: errors.iter().map(|e| e.abs().sum()).sum::<f64>() / (3.0 * n),
+            mse_m2: errors.iter().map(|e| e.norm_squared()).sum::<f64>() / (3.0 * n),
+            r2: (0..3).map(r2).fold(1.0, f64::min),
+            max_m: errors.iter().map(|e| e.norm()).fold(0.0, f64::max),
+        }
+    }
+}
+
+/// What playing a skill sends.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PlayReport {
+    /// The skill.
+    pub skill: String,
+    /// How long its motion takes, s.
+    pub duration_s: f64,
+    /// The bound asked for, m.
+    pub bound_m: f64,
+    /// Samples of the inferred motion.
+    pub samples: usize,
+    /// Checkpoints that stand for them.
+    pub checkpoints: usize,
+    /// Bytes of the encoded plan.
+    pub bytes: usize,
+    /// The rebuilt motion against the inferred one.
+    pub rebuilt: Scores,
+}
+
+/// What the operator prints with `--json`; `docs/commands.md` lists the fields.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+#[expect(
+    missing_docs,
+    reason = "the fields are documented where users look: docs/commands.md"
+)]
+pub enum Event {
+    Fingerprint {
+        fingerprint: String,
+    },
+    Note {
+        text: String,
+    },
+    Learned {
+        skill: String,
+        demonstrations: usize,
+        motion_components: usize,
+        predictor_components: usize,
+        bytes: usize,
+        speed95_m_s: f64,
+        reach_m: f64,
+    },
+    Plan(PlayReport),
+    Dialling {
+        why: String,
+    },
+    Connected {
+        epoch: u32,
+    },
+    Lost {
+        why: String,
+    },
+    Mapping {
+        robot: String,
+        scale: f64,
+        path_bound_m: f64,
+    },
+    Engaged {
+        engagement: u32,
+        mono_ns: i64,
+    },
+    Refused {
+        reason: String,
+    },
+    State {
+        state: String,
+        cause: String,
+        mono_ns: i64,
+    },
+    Progress {
+        done: f64,
+    },
+    Telemetry {
+        age_ms: u16,
+        delay_ms: u16,
+        clock_uncertainty_ms: f64,
+        clamps: u32,
+        received: u32,
+        dropped: u32,
+    },
+    Done {
+        completed: bool,
+        why: Option<String>,
+        zero_mono_ns: Option<i64>,
+        samples: u32,
+        messages: u32,
+        knots: u32,
+        sessions: u32,
+        bytes_on_wire: u64,
+        packets_on_wire: u64,
+        bytes_session_up: u64,
+        bytes_session_down: u64,
+    },
+}
+
+impl Event {
+    pub(super) fn done(summary: &Summary, task: &Task, epoch: Mono) -> Self {
+        let why = match &summary.outcome {
+            Outcome::Completed => None,
+            Outcome::Interrupted(why) => Some(why.clone()),
+        };
+        let Counts { sent, received, .. } = summary.total;
+        let motion = summary.engaged.motion;
+        Self::Done {
+            completed: why.is_none(),
+            why,
+            zero_mono_ns: task.zero().map(|t| t.0 + epoch.0),
+            samples: summary.counters.samples,
+            messages: summary.counters.messages,
+            knots: summary.counters.knots,
+            sessions: summary.sessions,
+            bytes_on_wire: motion.bytes,
+            packets_on_wire: motion.packets,
+            bytes_session_up: sent.bytes - motion.bytes,
+            bytes_session_down: received.bytes,
+        }
+    }
+
+    fn text(&self) -> Option<String> {
+        Some(match self {
+            Self::Fingerprint { fingerprint } => format!("fingerprint {fingerprint}"),
+            Self::Note { text } => format!("note: {text}"),
+            Self::Learned {
+                skill,
+                demonstrations,
+                motion_components,
+                predictor_components,
+                bytes,
+                speed95_m_s,
+                reach_m,
+            } => {
+                format!(
+                    "learned {skill} from {demonstrations} demonstrations: {motion_components} components over time, \
+                     {predictor_components} over state, {:.0} kB; 95 % of speeds below {speed95_m_s:.2} m/s, reach {reach_m:.2} m",
+                    *bytes as f64 / 1e3
+                )
+            }
+            Self::Plan(p) => format!(
+                "{}: {:.2} s in {} checkpoints ({} B) for {} samples; rebuilt within {:.2} mm of {:.2} mm allowed, R² {:.6}",
+                p.skill,
+                p.duration_s,
+                p.checkpoints,
+                p.bytes,
+                p.samples,
+                p.rebuilt.max_m * 1e3,
+                p.bound_m * 1e3,
+                p.rebuilt.r2
+            ),
+            Self::Dialling { why } => format!("dialling: {why}"),
+            Self::Connected { epoch } => format!("connected (session {epoch})"),
+            Self::Lost { why } => format!("link lost: {why}"),
+            Self::Mapping {
+                robot,
+                scale,
+                path_bound_m,
+            } => {
+                format!(
+                    "{robot} follows at scale {scale:.3}; path within {:.1} mm of the hand",
+                    path_bound_m * 1e3
+                )
+            }
+            Self::Engaged { engagement, .. } => format!("engaged #{engagement}"),
+            Self::Refused { reason } => format!("the robot declines: {reason}"),
+            Self::State { state, cause, .. } => format!("robot: {state} ({cause})"),
+            Self::Progress { .. } | Self::Telemetry { .. } => return None,
+            Self::Done {
+                samples,
+                messages,
+                knots,
+                bytes_on_wire,
+                bytes_session_up,
+                bytes_session_down,
+                ..
+            } => format!(
+                "{samples} samples in {messages} messages with {knots} path knots: {bytes_on_wire} B on the wire \
+                 (and {bytes_session_up} B up, {bytes_session_down} B down for the session)"
+            ),
+        })
+    }
+}
+
+/// Where events go.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Log {
+    pub(super) json: bool,
+}
+
+impl Log {
+    pub(super) fn say(self, event: &Event) {
+        if self.json {
+            emit(event);
+        } else if let Some(text) = event.text() {
+            println!("{text}");
+        }
+    }
+
+    pub(super) fn note(self, text: &impl ToString) {
+        self.say(&Event::Note {
+            text: text.to_string(),
+        });
+    }
+}
+
+/// Turns notices into events until the daemon ends; draws a progress bar if asked to.
+pub(super) async fn listen_to(
+    mut heard: mpsc::UnboundedReceiver<Notice>,
+    log: Log,
+    epoch: Mono,
+    progress: bool,
+) {
+    let bar = if progress {
+        ProgressBar::new(1000)
+    } else {
+        ProgressBar::hidden()
+    };
+    if let Ok(style) = ProgressStyle::with_template("{bar:40} {percent:>3} %  {msg}") {
+        bar.set_style(style);
+    }
+    while let Some(notice) = heard.recv().await {
+        let event = match notice {
+            Notice::Dialling { why } => Event::Dialling { why },
+            Notice::Connected { epoch } => Event::Connected { epoch },
+            Notice::Lost { why } => Event::Lost { why },
+            Notice::Mapping {
+                scale,
+                path_bound_m,
+                robot,
+            } => Event::Mapping {
+                robot,
+                scale,
+                path_bound_m,
+            },
+            Notice::Progress(done) => {
+                bar.set_position((done * 1e3) as u64);
+                Event::Progress { done }
+            }
+            Notice::Event(at, event) => match event {
+                session::Event::Ready => continue,
+                session::Event::Engaged { engagement, .. } => Event::Engaged {
+                    engagement,
+                    mono_ns: at.0 + epoch.0,
+                },
+                session::Event::Refused(reason) => Event::Refused {
+                    reason: format!("{reason:?}"),
+                },
+                session::Event::State(state, cause) => Event::State {
+                    state: format!("{state:?}"),
+                    cause: format!("{cause:?}"),
+                    mono_ns: at.0 + epoch.0,
+                },
+                session::Event::Telemetry(t) => {
+                    let uncertainty_ms = f64::from(t.clock_uncertainty_us) * 1e-3;
+                    bar.set_message(format!(
+                        "age {} ms, clock ±{uncertainty_ms:.0} ms, {} clamps",
+                        t.age_ms, t.clamps
+                    ));
+                    Event::Telemetry {
+                        age_ms: t.age_ms,
+                        delay_ms: t.delay_ms,
+                        clock_uncertainty_ms: uncertainty_ms,
+                        clamps: t.clamps,
+                        received: t.received,
+                        dropped: t.dropped,
+                    }
+                }
+            },
+        };
+        bar.suspend(|| log.say(&event));
+    }
+    bar.finish_and_clear();
+}

@@ -1,0 +1,214 @@
+//! The skills an operator has, learned now or loaded, and what to do with them.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::{Context, bail};
+use nalgebra::{SVector, Vector3};
+use telemime_protocol::checkpoint::{Plan, select};
+use telemime_protocol::skill::{Gmr, MAX_NAME_BYTES, Skill};
+use telemime_protocol::wire::codec;
+
+use super::Args;
+use super::report::{Event, Log, PlayReport, Scores};
+use crate::demonstration::{Demonstration, Demonstrations};
+use crate::learn::{LearnOptions, Progress, learn_skill};
+use crate::skill_file;
+
+/// Components of one mixture per skill when several share it (prediction.md §1).
+const SHARED_COMPONENTS: usize = 7;
+
+/// Inferred motions are sampled at this interval before they are compressed, s.
+const SAMPLE_S: f64 = 0.02;
+
+/// Skills by name, and the one mixture that mirrors them all.
+#[derive(Debug)]
+pub struct Skills {
+    all: Vec<Arc<Skill>>,
+    mirror: Option<Arc<Skill>>,
+}
+
+impl Skills {
+    pub(super) fn gather(args: &Args, log: &Log) -> anyhow::Result<Self> {
+        let mut skills = Self {
+            all: Vec::new(),
+            mirror: None,
+        };
+        let mut pooled: Vec<Demonstration> = Vec::new();
+        let options = LearnOptions {
+            seed: args.seed.unwrap_or(0),
+            ..LearnOptions::default()
+        };
+        for dir in &args.learn {
+            let found = Demonstrations::read_dir(dir, args.matching.as_deref())?;
+            found.notices.iter().for_each(|notice| log.note(notice));
+            let kept = keep_unseen(found.demonstrations, args.replay.as_deref(), log)?;
+            if kept.is_empty() {
+                bail!(
+                    "{}: nothing is left to learn from without the replayed recording",
+                    dir.display()
+                );
+            }
+            let skill = learn(&found.name, &kept, &options, log)?;
+            skills.push(Arc::new(skill))?;
+            pooled.extend(kept);
+        }
+        for path in &args.skill {
+            skills.push(Arc::new(skill_file::load(path)?))?;
+        }
+        skills.mirror = skills.all.first().cloned();
+        if args.learn.len() > 1 && args.play.is_none() {
+            let mut shared = options;
+            shared.predictor.components = SHARED_COMPONENTS * args.learn.len();
+            // Only its predictor is used: one time axis for different motions means nothing.
+            shared.motion_components = 1..=1;
+            let name: Vec<_> = skills
+                .all
+                .iter()
+                .take(args.learn.len())
+                .map(|s| s.name())
+                .collect();
+            let mut name = name.join("+");
+            while name.len() > MAX_NAME_BYTES {
+                name.pop();
+            }
+            skills.mirror = Some(Arc::new(learn(&name, &pooled, &shared, log)?));
+        } else if skills.all.len() > 1 && args.play.is_none() {
+            log.note(&format!(
+                "mirroring with {} alone: saved skills cannot be pooled; give their folders with --learn",
+                skills.all[0].name()
+            ));
+        }
+        Ok(skills)
+    }
+
+    fn push(&mut self, skill: Arc<Skill>) -> anyhow::Result<()> {
+        if self.all.iter().any(|s| s.name() == skill.name()) {
+            bail!("two skills are called {}: rename a folder", skill.name());
+        }
+        self.all.push(skill);
+        Ok(())
+    }
+
+    /// The model to mirror with, if there is any.
+    pub fn mirror(&self) -> Option<Arc<Skill>> {
+        self.mirror.clone()
+    }
+
+    /// The skill of this name.
+    ///
+    /// # Errors
+    /// One line that lists the names there are.
+    pub fn named(&self, name: &str) -> anyhow::Result<Arc<Skill>> {
+        let found = self.all.iter().find(|s| s.name() == name).cloned();
+        found.with_context(|| {
+            let known: Vec<_> = self.all.iter().map(|s| s.name()).collect();
+            if known.is_empty() {
+                "no skill is known: give --learn DIR or --skill FILE".to_owned()
+            } else {
+                format!("no skill `{name}`; known: {}", known.join(", "))
+            }
+        })
+    }
+
+    /// Reads the recording to be replayed, and refuses one a loaded skill was trained on.
+    ///
+    /// # Errors
+    /// One line that names the file.
+    pub fn unseen(&self, path: &Path) -> anyhow::Result<Demonstration> {
+        let recording = Demonstration::read_csv(path)?;
+        if let Some(skill) = self
+            .all
+            .iter()
+            .find(|s| s.was_trained_on(recording.sha256()))
+        {
+            bail!(
+                "{}: the skill {} was trained on this very recording; replay another one",
+                path.display(),
+                skill.name()
+            );
+        }
+        Ok(recording)
+    }
+}
+
+/// Leaves out the recording that will be replayed, by path and by content.
+fn keep_unseen(
+    all: Vec<Demonstration>,
+    replay: Option<&Path>,
+    log: &Log,
+) -> anyhow::Result<Vec<Demonstration>> {
+    let Some(path) = replay else { return Ok(all) };
+    let replayed = Demonstration::read_csv(path)?;
+    let place = |p: &Path| std::fs::canonicalize(p).unwrap_or_else(|_| p.to_owned());
+    let (same, kept): (Vec<_>, Vec<_>) = all
+        .into_iter()
+        .partition(|d| d.sha256() == replayed.sha256() || place(d.path()) == place(path));
+    for demonstration in same {
+        log.note(&format!(
+            "{} is replayed: it is not learned from",
+            demonstration.path().display()
+        ));
+    }
+    Ok(kept)
+}
+
+fn learn(
+    name: &str,
+    demonstrations: &[Demonstration],
+    options: &LearnOptions,
+    log: &Log,
+) -> anyhow::Result<Skill> {
+    let skill = learn_skill(name, demonstrations, options, |progress| {
+        if let Progress::Motion { degenerate, .. } = &progress {
+            degenerate
+                .iter()
+                .for_each(|d| log.note(&format!("{name}: {d:?}")));
+        }
+    })
+    .with_context(|| format!("cannot learn {name}"))?;
+    log.say(&Event::Learned {
+        skill: skill.name().to_owned(),
+        demonstrations: demonstrations.len(),
+        motion_components: skill.motion().components().len(),
+        predictor_components: skill.predictor().components().len(),
+        bytes: skill.to_bytes().len(),
+        speed95_m_s: skill.stats().speed95_m_s,
+        reach_m: skill.stats().reach_m,
+    });
+    Ok(skill)
+}
+
+/// The skill's motion by regression over time, compressed to checkpoints within `bound_m` of it.
+///
+/// # Errors
+/// A bound that cannot be held.
+pub fn infer(skill: &Skill, bound_m: f64) -> anyhow::Result<(Plan<3>, PlayReport)> {
+    let gmr = Gmr::<1, 3>::new(skill.motion())?;
+    let steps = (skill.duration_s() / SAMPLE_S).ceil().max(2.0) as usize;
+    let t: Vec<f64> = (0..=steps)
+        .map(|i| skill.duration_s() * i as f64 / steps as f64)
+        .collect();
+    let inferred: Vec<Vector3<f64>> = t
+        .iter()
+        .map(|&t| gmr.query(&SVector::from([t])).mean)
+        .collect();
+    let plan =
+        select::bounded(&t, &inferred, bound_m).with_context(|| format!("--bound {bound_m}"))?;
+    let spline = plan.spline()?;
+    let (start_s, end_s) = spline.span_s();
+    let rebuilt = t
+        .iter()
+        .map(|&t| spline.eval(t.clamp(start_s, end_s)).map(|jet| jet.x))
+        .collect::<Result<Vec<_>, _>>()?;
+    let report = PlayReport {
+        skill: skill.name().to_owned(),
+        duration_s: skill.duration_s(),
+        bound_m,
+        samples: t.len(),
+        checkpoints: plan.len(),
+        bytes: codec::encode(&plan).len(),
+        rebuilt: Scores::of(&inferred, &rebuilt),
+    };
+    Ok((plan, report))
+}
