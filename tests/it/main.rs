@@ -5,3 +5,4 @@ mod codec;
 mod mirror;
 mod paper;
 mod prediction;
+mod processes;
