@@ -5,3 +5,5 @@ mod codec;
 mod mirror;
 mod paper;
 mod prediction;
+mod safety;
+mod scene;
