@@ -6,3 +6,5 @@ mod mirror;
 mod paper;
 mod prediction;
 mod processes;
+mod safety;
+mod scene;
