@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use quinn::{Connection, Endpoint, SendStream, VarInt};
-use telemime_endpoint::cli::Word;
+use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{Control, ControlError, write_frame};
 use telemime_endpoint::meter::Counts;
 use telemime_endpoint::{HostClock, Meter, Mono, quic};
@@ -167,7 +167,7 @@ impl Daemon {
         loop {
             let link = tokio::select! {
                 biased;
-                _ = quit.wait_for(|quit| *quit) => break,
+                () = told(&mut quit) => break,
                 link = self.dial(summary.sessions == 0, task, notices) => link?,
             };
             let Some(link) = link else { break };
@@ -342,7 +342,7 @@ impl Daemon {
             let due = due.into_iter().flatten().min();
             tokio::select! {
                 biased;
-                _ = quit.wait_for(|quit| *quit) => {
+                () = told(quit) => {
                     let _ = self.leave(session, link).await;
                     return End::Quit;
                 }

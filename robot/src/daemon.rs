@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use quinn::{Connection, Endpoint, Incoming, SendStream, VarInt};
-use telemime_endpoint::cli::Word;
+use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{Control, ControlError, write_frame};
 use telemime_endpoint::{HostClock, quic};
 use telemime_protocol::skill::Skill;
@@ -108,7 +108,7 @@ impl Daemon {
                 .map(|a| self.clock.instant(a.session.poll_timeout().0));
             tokio::select! {
                 biased;
-                _ = quit.wait_for(|quit| *quit) => break,
+                () = told(&mut quit) => break,
                 Some(word) = words.recv() => self.order(match word {
                     Word::Stop => Order::Stop(Cause::LocalStop),
                     Word::Reset => Order::Reset { operator: active.is_some() },

@@ -55,6 +55,11 @@ pub enum Word {
     Reset,
 }
 
+/// Resolves once the watch is true, or its sender is gone.
+pub async fn told(quit: &mut watch::Receiver<bool>) {
+    let _ = quit.wait_for(|quit| *quit).await;
+}
+
 /// Ctrl-C, SIGTERM, `quit`, or (if asked for) the end of stdin turn the watch true; `stop` and `reset` arrive
 /// as words. stdin is read only when it is a terminal or `follow_stdin` is set.
 ///

@@ -354,12 +354,12 @@ impl Core {
             return Demand::Stop;
         }
         let since_s = now.secs_since(self.engaged_at);
-        let hand_m = match &self.drive {
+        // A hand is in the middle of a motion; a plan begins where the tip is.
+        let (hand_m, eased) = match &self.drive {
             Drive::Nothing => return Demand::Stop,
             Drive::Mirror { forecast, valid_at } => {
-                forecast
-                    .at(now.secs_since(*valid_at) + self.config.lag_s)
-                    .position
+                let horizon_s = now.secs_since(*valid_at) + self.config.lag_s;
+                (forecast.at(horizon_s).position, ramp(since_s / RAMP_S))
             }
             Drive::Play(trajectory) => {
                 if since_s > trajectory.duration_s + SETTLE_S {
@@ -367,15 +367,13 @@ impl Core {
                     return Demand::Stop;
                 }
                 let t_s = (since_s + self.config.lag_s).min(trajectory.duration_s);
-                trajectory
-                    .spline
-                    .eval(t_s)
-                    .map_or(self.mapping.hand_m, |jet| jet.x)
+                let jet = trajectory.spline.eval(t_s);
+                (jet.map_or(self.mapping.hand_m, |jet| jet.x), 1.0)
             }
         };
         let (placed, clamped) = self.mapping.place(hand_m, self.config.radius_m);
         self.out_of_reach = clamped;
-        self.target_m = self.mapping.tip_m + (placed - self.mapping.tip_m) * ramp(since_s / RAMP_S);
+        self.target_m = self.mapping.tip_m + (placed - self.mapping.tip_m) * eased;
         Demand::Follow {
             target: self.target_m,
             speed_scale: self.safety.speed_scale(now),
