@@ -6,6 +6,7 @@
 
 mod arms;
 mod codec;
+mod commands;
 mod layout;
 mod mirror;
 mod paper;
