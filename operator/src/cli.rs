@@ -405,6 +405,21 @@ mod tests {
     }
 
     #[test]
+    fn the_documented_configuration_is_understood_and_complete() {
+        let text = include_str!("../../docs/commands.md");
+        let example = text
+            .split("```toml operator\n")
+            .nth(1)
+            .and_then(|rest| rest.split("```").next())
+            .unwrap()
+            .replace("# play", "play")
+            .replace("# bound_m", "bound_m");
+        let file: File = toml::from_str(&example).unwrap();
+        assert!(!format!("{file:?}").contains("None"), "a key is missing");
+        parse_future_bound(&file.future_bound.unwrap()).unwrap();
+    }
+
+    #[test]
     fn impossible_settings_are_refused_by_name() {
         let refused = |args: Args| args.session().unwrap_err().to_string();
         assert!(

@@ -432,3 +432,21 @@ impl Recorder {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_documented_configuration_is_understood_and_complete() {
+        let text = include_str!("../../docs/commands.md");
+        let example = text
+            .split("```toml robot\n")
+            .nth(1)
+            .and_then(|rest| rest.split("```").next())
+            .unwrap();
+        let file: File = toml::from_str(example).unwrap();
+        assert!(!format!("{file:?}").contains("None"), "a key is missing");
+        assert_eq!((file.peers.len(), file.fixed["finger_joint"]), (1, 0.02));
+    }
+}

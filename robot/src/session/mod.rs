@@ -382,7 +382,10 @@ impl Session {
                     .filter(|(id, _)| id == plan)
                     .ok_or(Refusal::BadPlan)?;
                 let spline = held.spline().map_err(|_| Refusal::BadPlan)?;
-                let duration_s = spline.span_s().1;
+                let (start_s, duration_s) = spline.span_s();
+                if start_s != 0.0 {
+                    return Err(Refusal::BadPlan);
+                }
                 (
                     Source::Play(Box::new(Trajectory { spline, duration_s })),
                     None,
