@@ -225,9 +225,7 @@ fn a_killed_operator_leaves_a_stopped_arm_and_a_robot_that_serves_the_next() {
         !next.end().0.success(),
         "an interrupted task is not a success"
     );
-    robot.event_where("state", |e| {
-        e["state"] == "Ready" || e["state"] == "Holding"
-    });
+    robot.event_where("state", |e| e["state"] == "Idle");
     robot.signal(Signal::INT);
     assert!(robot.end().0.success());
 }
