@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use clap::{Parser, Subcommand};
 use telemime_endpoint::HostClock;
-use telemime_endpoint::cli as shell;
+use telemime_endpoint::cli::{self as shell, one_line};
 use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
 
 use crate::relay::{Passage, Relay, RelayConfig};
@@ -108,7 +108,7 @@ pub fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
-            eprintln!("telemime: {e:#}");
+            eprintln!("telemime: {}", one_line(e.chain()));
             ExitCode::FAILURE
         }
     }

@@ -248,6 +248,7 @@ impl Daemon {
                 }
             });
         while let Ok(report) = self.servo.reports.pop() {
+            self.info.state = report.state;
             if let Some(active) = active.as_deref_mut() {
                 active.session.handle_report(&report, timing);
             }

@@ -153,7 +153,7 @@ pub(super) fn mirror(
     verdict: &Verdict,
 ) -> anyhow::Result<Vec<PathBuf>> {
     let over_time = |d: usize| Panel {
-        title: format!("{} of the hand, and of the tip mapped back to it", AXES[d]),
+        title: format!("{}: hand, and tip mapped back to it", AXES[d]),
         x_label: "time / s".into(),
         y_label: axis_label(d),
         equal_axes: false,

@@ -16,6 +16,7 @@ use telemime_operator::daemon::{
 use telemime_operator::session::SessionConfig;
 use telemime_operator::task::Task;
 use telemime_protocol::skill::Skill;
+use telemime_protocol::time::Stamp;
 use telemime_robot::daemon::{Daemon as RobotDaemon, Notice as RobotNotice};
 use telemime_robot::rig::Rig;
 use telemime_robot::servo::{self, Report};
@@ -41,6 +42,9 @@ pub enum PairError {
     #[error(transparent)]
     Operator(#[from] DaemonError),
 }
+
+/// Not the robot's clock: the operators' session clock is an hour and a half off.
+const SESSION_ZERO: Mono = Mono(-5_400_000_000_000);
 
 fn host(n: u8) -> SocketAddr {
     SocketAddr::new(IpAddr::V4(Ipv4Addr::new(192, 0, 2, n)), 4433)
@@ -198,6 +202,11 @@ impl Pair {
         self.clock.now()
     }
 
+    /// When, on the common clock, the operators' session clock shows `stamp`.
+    pub fn to_mono(&self, stamp: Stamp) -> Mono {
+        Mono(stamp.0 + SESSION_ZERO.0)
+    }
+
     /// Waits until `predicate` holds for the newest tick; false if it does not within `within_s` virtual seconds.
     pub async fn wait_for(&self, within_s: f64, predicate: impl Fn(&Report) -> bool) -> bool {
         let deadline = self.now().offset_by_secs(within_s);
@@ -245,24 +254,13 @@ impl Pair {
         link: &LinkConfig,
         seed: u64,
     ) -> Result<Operator, PairError> {
-        self.operators += 1;
-        let own = host(1 + self.operators);
-        self.network.link(own, host(1), link.clone(), seed);
-        self.network
-            .link(host(1), own, link.clone(), seed ^ 0x9e37_79b9_7f4a_7c15);
-        let meter = Meter::default();
-        let socket = quic::Socket::Abstract {
-            socket: self.network.socket(own),
-            seed: [self.operators + 1; 32],
-        };
-        let endpoint = quic::client(identity, self.robot_identity.fingerprint(), socket, &meter)?;
+        let (endpoint, meter) = self.client(identity, link, seed)?;
         let daemon = OperatorDaemon {
             endpoint,
             meter,
             robot: host(1),
             clock: self.clock,
-            // Not the robot's clock: a session clock of its own, an hour and a half off.
-            epoch: Mono(-5_400_000_000_000),
+            epoch: SESSION_ZERO,
             skill,
             config,
             patience: Duration::from_secs(5),
@@ -280,6 +278,40 @@ impl Pair {
             quit,
             words,
         })
+    }
+
+    /// A bare QUIC client where an operator would be, to say to [`Pair::robot_addr`] what no operator says.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn stranger(&mut self, link: &LinkConfig, seed: u64) -> Result<quinn::Endpoint, PairError> {
+        let identity = self.operator_identity_copy()?;
+        Ok(self.client(&identity, link, seed)?.0)
+    }
+
+    /// Where the robot listens.
+    pub fn robot_addr(&self) -> SocketAddr {
+        host(1)
+    }
+
+    fn client(
+        &mut self,
+        identity: &Identity,
+        link: &LinkConfig,
+        seed: u64,
+    ) -> Result<(quinn::Endpoint, Meter), PairError> {
+        self.operators += 1;
+        let own = host(1 + self.operators);
+        self.network.link(own, host(1), link.clone(), seed);
+        self.network
+            .link(host(1), own, link.clone(), seed ^ 0x9e37_79b9_7f4a_7c15);
+        let meter = Meter::default();
+        let socket = quic::Socket::Abstract {
+            socket: self.network.socket(own),
+            seed: [self.operators + 1; 32],
+        };
+        let endpoint = quic::client(identity, self.robot_identity.fingerprint(), socket, &meter)?;
+        Ok((endpoint, meter))
     }
 
     fn operator_identity_copy(&self) -> Result<Identity, IdentityError> {

@@ -11,4 +11,7 @@ mod layout;
 mod mirror;
 mod paper;
 mod prediction;
+mod processes;
 mod protocol;
+mod safety;
+mod scene;

@@ -1,107 +1,164 @@
 //! Mirror over a shaped link, both daemons on the virtual clock.
 
-use std::sync::Arc;
-
+use nalgebra::Vector3;
 use telemime::ground::{Pair, run_virtual};
-use telemime::measure::{Track, follow, rmse_m};
-use telemime_operator::demonstration::Demonstration;
-use telemime_operator::learn::{LearnOptions, learn_skill};
-use telemime_operator::session::SessionConfig;
-use telemime_operator::task::{Outcome, Recording, Task};
-use telemime_robot::rig::{Rig, RigOptions};
-use telemime_sim::link::LinkConfig;
+use telemime::measure::{Track, follow, rmse_m, sample_and_hold};
+use telemime_operator::daemon::{Notice, Summary};
+use telemime_operator::task::Outcome;
+use telemime_protocol::spline::HermiteSpan;
+use telemime_robot::daemon::Notice as RobotNotice;
+use telemime_robot::rig::Rig;
+use telemime_robot::servo::Report;
+use telemime_sim::link::{Fate, Link};
+
+use crate::scene::{finish, mirroring, rig, shaped, unseen};
+
+/// Time (s), position, velocity of a knot.
+type Knot = (f64, Vector3<f64>, Vector3<f64>);
+
+/// A run, its times those of the recording.
+struct Run {
+    reports: Vec<Report>,
+    /// The robot's clock when the recording began, ns.
+    zero: i64,
+    summary: Summary,
+    path: Vec<Knot>,
+    path_bound_m: f64,
+}
+
+fn run(rig: &Rig, seed: u64) -> Run {
+    run_virtual(async {
+        let mut pair = Pair::start(rig).unwrap();
+        let operator = mirroring(&mut pair, &shaped(), seed);
+        let (summary, task, notices) = finish(operator).await;
+        let session_zero = task.zero().unwrap();
+        let mapping = |n: &Notice| match n {
+            Notice::Mapping { path_bound_m, .. } => Some(*path_bound_m),
+            _ => None,
+        };
+        pair.run_for(0.5).await;
+        let path = pair.robot.notices().iter().find_map(|n| match n {
+            RobotNotice::Path(path) => Some(path.clone()),
+            _ => None,
+        });
+        let from_zero = |(t_s, x, v): (f64, [f64; 3], [f64; 3])| {
+            (t_s - session_zero.as_secs_f64(), x.into(), v.into())
+        };
+        Run {
+            reports: pair.robot.reports().clone(),
+            zero: pair.to_mono(session_zero).0,
+            summary: summary.unwrap(),
+            path: path.unwrap().into_iter().map(from_zero).collect(),
+            path_bound_m: notices.iter().find_map(mapping).unwrap(),
+        }
+    })
+    .unwrap()
+}
+
+impl Run {
+    /// What the arm did, as hand positions.
+    fn tip(&self) -> Track {
+        let engaged = self.reports.iter().filter(|r| r.engagement != 0);
+        let point = |r: &Report| {
+            let t_s = (r.at.0 - self.zero) as f64 * 1e-9;
+            (t_s, r.mapping.unplace(r.tip_m))
+        };
+        Track::new(engaged.map(point).collect()).unwrap()
+    }
+}
 
 #[test]
 fn the_tip_moves_with_the_hand() {
-    let dir = std::path::PathBuf::from(std::env::var("TELEMIME_DATA").unwrap())
-        .join("data/demos/utd_mhad/a03_wave");
-    let read = |n: u32| Demonstration::read_csv(dir.join(format!("a3_s2_t{n}.csv"))).unwrap();
-    let skill = learn_skill(
-        "wave",
-        &[read(1), read(2), read(3)],
-        &LearnOptions::default(),
-        |_| {},
-    )
-    .unwrap();
-    let rig = Rig::load(&RigOptions::default()).unwrap();
-    let hand = read(4);
-    let samples: Vec<_> = hand.samples().iter().map(|s| (s.t_s, s.position)).collect();
-    let link = LinkConfig {
-        delay_s: 0.1,
-        jitter_s: 0.01,
-        loss: 0.01,
-        ..LinkConfig::default()
-    };
-    let begun = std::time::Instant::now();
-    run_virtual(async {
-        let mut pair = Pair::start(&rig).unwrap();
-        let task = Task::replay(Recording {
-            samples: samples.clone(),
-            rest_s: 1.0,
-        });
-        let mut operator = pair
-            .operator(
-                task,
-                Some(Arc::new(skill)),
-                SessionConfig::default(),
-                &link,
-                7,
-            )
-            .unwrap();
-        let (summary, task) = (&mut operator.done).await.unwrap();
-        while let Ok(n) = operator.notices.try_recv() {
-            let s = format!("{n:?}");
-            if !s.contains("Telemetry") {
-                println!("{s}");
-            }
-        }
-        println!("{summary:?}");
-        let summary = summary.unwrap();
-        assert_eq!(summary.outcome, Outcome::Completed);
-        let zero = task.zero().unwrap().0 - 5_400_000_000_000;
-        let truth = Track::new(samples.clone()).unwrap();
-        let end = truth.span_s().1;
-        let reports = pair.robot.reports();
-        let time = |r: &telemime_robot::servo::Report| (r.at.0 - zero) as f64 * 1e-9;
-        let tip: Vec<_> = reports
-            .iter()
-            .filter(|r| r.engagement != 0)
-            .map(|r| (time(r), r.mapping.unplace(r.tip_m)))
-            .collect();
-        let target: Vec<_> = reports
-            .iter()
-            .filter(|r| r.engagement != 0)
-            .map(|r| (time(r), r.mapping.unplace(r.target_m)))
-            .collect();
-        let mapping = reports.last().unwrap().mapping;
-        let from = tip[0].0;
-        println!("from {from} end {end}");
-        let tip = Track::new(tip).unwrap();
-        let target = Track::new(target).unwrap();
-        let grid: Vec<f64> = (0..(end * 1000.0) as i32)
-            .map(|i| i as f64 * 1e-3)
-            .collect();
-        let show = |name: &str, t: &Track| {
-            println!(
-                "{name}: rmse {:.4} lag {:?}",
-                rmse_m(t, &truth, &grid),
-                t.lag_behind(&truth, &grid)
-            )
-        };
-        show("tip", &tip);
-        show("target", &target);
-        let lag = rig.lag_s();
-        show(
-            "floor",
-            &follow(&rig, &mapping, from, end, |t| Some(truth.at(t + lag))).tip,
-        );
-        show(
-            "delayed same arm",
-            &follow(&rig, &mapping, from, end, |t| Some(truth.at(t - 0.1))).tip,
-        );
-        let delayed = Track::new(grid.iter().map(|&t| (t, truth.at(t - 0.1))).collect()).unwrap();
-        show("delayed", &delayed);
+    let rig = rig();
+    let run = run(&rig, 7);
+    assert_eq!(run.summary.outcome, Outcome::Completed);
+    let hand = Track::new(unseen()).unwrap();
+    let end_s = hand.span_s().1;
+    let grid: Vec<f64> = (0..(end_s * 1e3) as i32)
+        .map(|i| f64::from(i) * 1e-3)
+        .collect();
+    let tip = run.tip();
+    let mapping = run.reports.last().unwrap().mapping;
+
+    // The same arm, told every raw sample over a link of the same kind.
+    let mut link = Link::new(shaped(), 7);
+    let arrivals: Vec<_> = hand
+        .points()
+        .iter()
+        .filter_map(|(t_s, x)| match link.send((t_s * 1e9) as i64, 44) {
+            Fate::Deliver { at_ns } => Some((at_ns as f64 * 1e-9, *t_s, *x)),
+            Fate::Lost | Fate::Overflow => None,
+        })
+        .collect();
+    let from_s = tip.span_s().0;
+    let same_arm = follow(&rig, &mapping, from_s, end_s, |t| {
+        sample_and_hold(&arrivals, t)
     })
-    .unwrap();
-    println!("took {:?}", begun.elapsed());
+    .tip;
+    let ahead = follow(&rig, &mapping, from_s, end_s, |t| {
+        Some(hand.at(t + rig.lag_s()))
+    });
+
+    let error = |track: &Track| rmse_m(track, &hand, &grid);
+    let (predicted, delayed, floor) = (error(&tip), error(&same_arm), error(&ahead.tip));
+    let lag = |track: &Track| track.lag_behind(&hand, &grid).0;
+    println!(
+        "tip {predicted:.4} m ({:.0} ms), delayed {delayed:.4} m ({:.0} ms), floor {floor:.4} m",
+        lag(&tip) * 1e3,
+        lag(&same_arm) * 1e3,
+    );
+    assert!(predicted < 0.6 * delayed, "{predicted} m of {delayed} m");
+    assert!(floor < predicted, "nobody knows better than the truth");
+    assert!(lag(&tip).abs() < 0.03 && lag(&same_arm) > 0.12);
+    let (sent, raw) = (
+        run.summary.engaged.motion.bytes,
+        44 * u64::from(run.summary.counters.samples),
+    );
+    assert!(sent > 0 && sent < raw, "{sent} B of motion, {raw} B raw");
+}
+
+#[test]
+fn the_robot_holds_the_path_within_its_bound() {
+    let run = run(&rig(), 11);
+    let samples = unseen();
+    let end_s = samples[samples.len() - 1].0;
+    let (first_s, last_s) = (run.path[0].0, run.path[run.path.len() - 1].0);
+    assert!(
+        first_s < 0.0 && last_s > end_s - 1.3,
+        "{first_s} to {last_s}"
+    );
+    let mut covered = 0;
+    for (t_s, x) in samples.iter().filter(|s| s.0 <= last_s) {
+        let after = run.path.partition_point(|k| k.0 <= *t_s).max(1);
+        let (a, b) = (
+            &run.path[after - 1],
+            &run.path[after.min(run.path.len() - 1)],
+        );
+        if b.0 - a.0 <= 0.0 {
+            continue;
+        }
+        let span = HermiteSpan::<3>::new(b.0 - a.0, [a.1, a.2], [b.1, b.2]).unwrap();
+        let error_m = (span.eval(t_s - a.0).unwrap().x - x).norm();
+        // Stamps are rounded to 10 µs: at 10 m/s that is another 0.1 mm.
+        assert!(
+            error_m <= run.path_bound_m + 1e-4,
+            "{error_m} m off at {t_s} s, the bound is {} m",
+            run.path_bound_m
+        );
+        covered += 1;
+    }
+    assert!(covered as f64 > 0.8 * samples.len() as f64, "{covered}");
+}
+
+#[test]
+fn the_same_seed_gives_the_same_run() {
+    let rig = rig();
+    let (a, b, other) = (run(&rig, 5), run(&rig, 5), run(&rig, 6));
+    assert_eq!(a.reports.len(), b.reports.len());
+    let differs = a.reports.iter().zip(&b.reports).position(|(a, b)| a != b);
+    assert_eq!(differs, None, "the first tick that differs");
+    assert_eq!(a.path, b.path);
+    assert_eq!(a.summary.total, b.summary.total);
+    assert_eq!(a.summary.counters, b.summary.counters);
+    assert!(a.reports != other.reports, "the seed matters");
 }

@@ -2,7 +2,7 @@ use nalgebra::Vector3;
 use proptest::prelude::*;
 
 use super::*;
-use crate::skill::tests::example;
+use crate::skill::example;
 use crate::time::Stamp;
 
 const UNDAMPED: Params = Params {

@@ -1,6 +1,8 @@
 //! What a skill is: a motion to play, a predictor to mirror with, and where both came from.
 
 mod bytes;
+#[cfg(any(test, feature = "testing"))]
+mod example;
 mod file;
 pub(crate) mod gmm;
 mod gmr;
@@ -14,6 +16,8 @@ use sha2::{Digest, Sha256};
 use crate::predict::{Model, ModelError};
 use crate::wire::codec::DecodeError;
 
+#[cfg(any(test, feature = "testing"))]
+pub use example::example;
 pub use file::FileError;
 pub use gmm::{Component, Gmm, GmmError, MAX_COMPONENTS};
 pub use gmr::{Gmr, GmrError, Regressed};
@@ -203,7 +207,7 @@ impl Skill {
 }
 
 #[cfg(test)]
-pub(crate) mod tests;
+mod tests;
 
 fn sha256(bytes: &[u8]) -> [u8; 32] {
     Sha256::digest(bytes).into()

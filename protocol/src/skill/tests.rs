@@ -1,80 +1,9 @@
-use nalgebra::{SMatrix, SVector, Vector3, Vector4};
+use nalgebra::{SMatrix, SVector};
 use proptest::prelude::*;
 
+use super::example::{example, example_model};
 use super::*;
-use crate::predict::{
-    BLOCK, Calibration, FEATURES, MAX_KNOTS, Regression, Standardisation, TARGETS,
-};
-
-/// A skill of no particular meaning: `k` components everywhere, all numbers different.
-pub(crate) fn example(k: usize, knots: usize) -> Skill {
-    Skill::new(
-        "wave".to_owned(),
-        &Gmm::new((0..k).map(|i| {
-            let u = i as f64;
-            let mean = Vector4::new(u, 0.1 * u, 1.0 - u, 0.3);
-            (
-                1.0 / k as f64,
-                mean,
-                SMatrix::identity() * (0.01 + 0.001 * u),
-            )
-        }))
-        .unwrap(),
-        2.5,
-        &example_model(k, knots),
-        Stats {
-            speed95_m_s: 4.0,
-            acceleration95_m_s2: 60.0,
-            reach_m: 0.9,
-            min: Vector3::new(-1.0, 0.0, 2.0),
-            max: Vector3::new(1.0, 1.5, 3.0),
-        },
-        Provenance {
-            producer: "a test".to_owned(),
-            seed: 7,
-            sources: vec![Source {
-                name: "take one".to_owned(),
-                sha256: [9; 32],
-            }],
-        },
-    )
-    .unwrap()
-}
-
-fn example_model(k: usize, knots: usize) -> Model {
-    let component = |i: usize| {
-        let u = i as f64 / k as f64;
-        let mut c = Regression {
-            weight: 1.0 / k as f64,
-            mean: SVector::from_fn(|j, _| libm::sin(u + j as f64)),
-            factor: SMatrix::identity() * (0.5 + u),
-            target: [0.0; TARGETS],
-            gain: [[0.0; TARGETS]; FEATURES],
-            residual: [[0.0; BLOCK]; MAX_KNOTS],
-        };
-        c.factor[(3, 1)] = 0.2;
-        for j in 0..3 * knots {
-            c.target[j] = 0.01 * libm::cos(u + j as f64);
-            for (f, row) in c.gain.iter_mut().enumerate() {
-                row[j] = 0.001 * libm::sin(u + (j * f) as f64);
-            }
-        }
-        for v in &mut c.residual[..knots] {
-            *v = [1e-4 * (1.0 + u), 0.0, 1e-5, 2e-4, 0.0, 3e-4];
-        }
-        c
-    };
-    Model::new(
-        knots,
-        Standardisation {
-            mean: SVector::from_fn(|j, _| 0.1 * j as f64),
-            scale: SVector::from_fn(|j, _| 0.05 + 0.01 * (j / 3) as f64),
-        },
-        (0..k).map(component).collect(),
-        Calibration::UNTRIED,
-    )
-    .unwrap()
-}
+use crate::predict::{Calibration, Regression, Standardisation};
 
 #[test]
 fn a_skill_is_what_its_bytes_say() {

@@ -43,11 +43,12 @@ impl WireState {
         let largest = offsets.iter().map(|o| o.amax()).fold(0.0, f64::max);
         let (mut exponent, mut step) = (0, MEMORY_STEP_M);
         while largest > 127.0 * step {
+            // A hand that jumped in from far away drags memories that no exponent can carry.
+            if exponent == MAX_EXPONENT {
+                return None;
+            }
             exponent += 1;
             step *= 2.0;
-        }
-        if exponent > MAX_EXPONENT {
-            return None;
         }
         let memory = offsets.map(|o| o.map(|v| (v / step).round() as i8).into());
         Some(Self {

@@ -103,7 +103,7 @@ pub enum Order {
 }
 
 /// What the servo tells the session after every tick.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Report {
     /// Counts ticks.
     pub tick: u64,

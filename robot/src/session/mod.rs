@@ -98,6 +98,7 @@ pub struct Session {
     plan: Option<(u32, Plan<3>)>,
     mirror: Option<Mirror>,
     engagement: u32,
+    requested_at: Mono,
     acknowledged: u32,
     newest_seq: u32,
     delay_s: f64,
@@ -130,6 +131,7 @@ impl Session {
             plan: None,
             mirror: None,
             engagement: 0,
+            requested_at: now,
             acknowledged: 0,
             newest_seq: 0,
             delay_s: 0.0,
@@ -200,7 +202,16 @@ impl Session {
                     self.order(Order::Release);
                 }
             }
-            OperatorControl::EmergencyStop => self.order(Order::Stop(Cause::OperatorStop)),
+            OperatorControl::EmergencyStop => {
+                self.order(Order::Stop(Cause::OperatorStop));
+                // A stop on top of a stop changes no state: without this the operator would wait for news.
+                if let Some(report) = self.report.filter(|r| r.state == RobotState::Stopped) {
+                    self.send(&RobotControl::State {
+                        state: report.state,
+                        cause: report.cause,
+                    });
+                }
+            }
             OperatorControl::Reset => self.order(Order::Reset { operator: true }),
             OperatorControl::Goodbye => self.outputs.push_back(Output::Goodbye),
         }
@@ -251,8 +262,10 @@ impl Session {
         let changed = self.transitions != Some(report.transitions);
         self.transitions = Some(report.transitions);
         self.report = Some(*report);
+        // Numbers start afresh with every session: what was engaged before the request is another's.
         if self.engagement != 0
             && report.engagement == self.engagement
+            && report.engaged_at >= self.requested_at
             && self.acknowledged != self.engagement
         {
             self.acknowledged = self.engagement;
@@ -380,6 +393,7 @@ impl Session {
             }
         };
         self.engagement = engage.engagement;
+        self.requested_at = now;
         self.mirror = mirror;
         self.order(Order::Engage(Engagement {
             number: engage.engagement,

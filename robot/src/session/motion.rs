@@ -98,6 +98,9 @@ impl Session {
             return false;
         };
         let age_s = now.secs_since(sent_at);
+        if age_s < -self.config.max_delay_s {
+            return false;
+        }
         let lease_s = f64::from(lease_ms) * 1e-3 - (age_s - self.config.max_delay_s).max(0.0);
         if lease_s <= 0.0 {
             return false;

@@ -1,0 +1,287 @@
+//! Mirror: when the operator speaks, and what it says.
+
+use super::*;
+use nalgebra::UnitQuaternion;
+use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid, TICK_NS};
+use telemime_protocol::predict::Forecast;
+use telemime_protocol::wire::knots;
+use telemime_protocol::wire::v1::model_tag;
+
+fn bound(bound_m: f64) -> SessionConfig {
+    SessionConfig {
+        future_bound: FutureBound::Absolute(bound_m),
+        ..SessionConfig::default()
+    }
+}
+
+#[test]
+fn a_request_carries_the_hand_and_the_mapping() {
+    let config = SessionConfig {
+        rotation: UnitQuaternion::from_euler_angles(0.1, 0.2, 0.3),
+        path_bound_m: Some(0.0123),
+        scale: Some(0.2),
+        ..SessionConfig::default()
+    };
+    let skill = example(2, 24);
+    let tag = model_tag(&skill.id().0);
+    let mut bench = Bench::ready(config, Some(skill));
+    bench.sample(home());
+    bench.sample(home() + Vector3::x() * 0.05);
+    bench.session.engage(bench.now);
+    bench.drain();
+    let [OperatorControl::Engage(engage)] = &bench.control[..] else {
+        panic!("{:?}", bench.control)
+    };
+    assert_eq!((engage.engagement, engage.lease_ms), (1, 650));
+    assert_eq!((engage.scale, engage.path_bound_um), (0.2, 12_300));
+    let q = config.rotation.as_ref();
+    let expected = [q.w, q.i, q.j, q.k].map(|v| v as f32);
+    assert_eq!(engage.rotation, expected);
+    let Drive::Mirror { state, model, .. } = &engage.drive else {
+        panic!("{:?}", engage.drive)
+    };
+    let state = state.dequantise();
+    assert_eq!((*model, state.t), (tag, bench.now));
+    assert!((state.x - home() - Vector3::x() * 0.05).norm() < 1e-4);
+    assert!(bench.datagrams.is_empty());
+}
+
+#[test]
+fn a_hand_at_rest_is_confirmed_at_the_largest_silence_and_no_oftener() {
+    let mut bench = Bench::engaged(bound(0.02), None);
+    bench.sample(home());
+    bench.forget();
+    let begun = bench.now;
+    for _ in 0..60 {
+        bench.sample(home());
+    }
+    let motions = bench.motions();
+    // The 60 samples span 1.98 s.
+    assert_eq!(motions.len(), 9);
+    for (i, m) in motions.iter().enumerate() {
+        assert_eq!((m.epoch, m.engagement, m.lease_ms), (EPOCH, 1, 650));
+        assert_eq!(m.seq, motions[0].seq + i as u32, "no number is left out");
+        assert!(m.state.t_us > begun.0 / 1000 - 1);
+    }
+    bench.forget();
+    bench.idle(2000);
+    assert_eq!(
+        bench.motions().len(),
+        10,
+        "nor does the silence depend on samples"
+    );
+}
+
+#[test]
+fn it_speaks_when_the_robots_prediction_goes_wrong_and_only_then() {
+    let mut bench = Bench::engaged(bound(0.05), None);
+    let v = Vector3::new(1.0, 0.0, 0.0);
+    let mut x = home();
+    for _ in 0..60 {
+        x += v * 0.033;
+        bench.sample(x);
+    }
+    bench.forget();
+    for _ in 0..30 {
+        x += v * 0.033;
+        bench.sample(x);
+    }
+    let steady = bench.motions().len();
+    assert!(steady < 10, "steady motion is predicted: {steady} messages");
+    bench.idle(100);
+    bench.forget();
+    // The hand stops dead: the robot, told of 1 m/s, runs past it.
+    bench.sample(x);
+    let said = bench.motions().last().map(|m| m.state.t_us);
+    assert_eq!(said, Some(bench.now.0 / 1000), "with the very sample");
+}
+
+#[test]
+fn unless_it_speaks_the_robots_prediction_is_within_the_bound() {
+    let bound_m = 0.03;
+    let config = SessionConfig {
+        gain: 1.0,
+        ..bound(bound_m)
+    };
+    let mut bench = Bench::engaged(config, None);
+    bench.receives(&RobotDatagram::Telemetry(telemetry(1, 0)));
+    let horizon_s = 0.1 + f64::from(info(None).lag_s);
+    let (mut silent, mut told) = (0, None::<Forecast>);
+    for i in 0..300 {
+        bench.forget();
+        let phase = 0.15 * f64::from(i);
+        bench.sample(home() + Vector3::new(phase.sin(), (0.7 * phase).cos(), 0.0) * 0.3);
+        let motions = bench.motions();
+        if let Some(motion) = motions.last() {
+            let state = motion.state.dequantise();
+            told = Some(Forecast::constant_velocity(
+                &state,
+                &motion.params.dequantise(),
+            ));
+            continue;
+        }
+        silent += 1;
+        // What the newest sample gives is what the operator would say now, were it to speak.
+        let mut probe = Bench::engaged(config, None);
+        std::mem::swap(&mut probe.session, &mut bench.session);
+        probe.session.speak(bench.now);
+        probe.drain();
+        let newest = &probe.motions()[0];
+        let known =
+            Forecast::constant_velocity(&newest.state.dequantise(), &newest.params.dequantise());
+        let held = told.expect("it spoke first");
+        let arrival = bench.now.offset_by_secs(horizon_s);
+        let at = |f: &Forecast| f.at(arrival.secs_since(f.t)).position;
+        let error_m = (at(&held) - at(&known)).norm();
+        assert!(error_m <= bound_m, "silent at {error_m} m off");
+        told = Some(known);
+        std::mem::swap(&mut probe.session, &mut bench.session);
+    }
+    assert!(silent > 30, "it was silent {silent} times of 300");
+}
+
+#[test]
+fn keyframes_carry_a_checksum_of_what_the_robot_will_compute() {
+    let skill = example(2, 24);
+    let mut bench = Bench::engaged(bound(0.02), Some(skill.clone()));
+    for i in 0..40 {
+        bench.sample(home() + Vector3::x() * (0.1 * (0.3 * f64::from(i)).sin()));
+        bench.idle(200);
+    }
+    let motions = bench.motions();
+    let sums: Vec<_> = motions.iter().filter(|m| m.checksum.is_some()).collect();
+    assert!(sums.len() >= motions.len() / 8 && sums.len() < motions.len() / 2);
+    for m in sums {
+        let forecast = skill
+            .predictor()
+            .forecast(&m.state.dequantise(), &m.params.dequantise());
+        assert_eq!(m.checksum, Some(forecast.checksum()));
+    }
+}
+
+#[test]
+fn late_repeated_and_impossible_samples_are_dropped_and_counted() {
+    let mut bench = Bench::engaged(bound(0.02), None);
+    bench.sample(home());
+    let before = bench.session.counters();
+    bench.forget();
+    for (t, x) in [
+        (bench.now, home() + Vector3::x()),
+        (Stamp(bench.now.0 - MS), home() + Vector3::x()),
+        (Stamp(bench.now.0 + MS), Vector3::repeat(f64::NAN)),
+    ] {
+        bench.session.handle_sample(bench.now, HandSample { t, x });
+    }
+    bench.drain();
+    assert!(bench.datagrams.is_empty());
+    let counters = bench.session.counters();
+    assert_eq!(counters.dropped, before.dropped + 3);
+    assert_eq!(counters.samples, before.samples);
+}
+
+#[test]
+fn a_hand_out_of_range_is_not_sent_and_does_no_harm() {
+    let mut bench = Bench::engaged(bound(0.02), None);
+    for x in [home() * 1e300, home(), home() * 60.0, home()] {
+        bench.forget();
+        bench.sample(x);
+        assert!(
+            bench
+                .motions()
+                .iter()
+                .all(|m| m.state.dequantise().x.norm() < 174.0)
+        );
+    }
+    for _ in 0..60 {
+        bench.sample(home());
+    }
+    assert_eq!(bench.session.state(), RobotState::Engaged);
+}
+
+/// A hand for some seconds over a link that loses what `lost` says, acknowledged `delay` samples late:
+/// the path the robot ends with, the samples, and the knots made.
+fn streamed(
+    lost: impl Fn(usize) -> bool,
+    acknowledge: bool,
+) -> (PathDecoder, Vec<(Stamp, Vector3<f64>)>, u32, usize) {
+    const BOUND_M: f64 = 0.005;
+    let config = SessionConfig {
+        path_bound_m: Some(BOUND_M),
+        ..bound(0.05)
+    };
+    let mut bench = Bench::engaged(config, None);
+    let grid = PathGrid::for_bound(BOUND_M).unwrap();
+    let mut path = PathDecoder::new(grid, 4096);
+    let (mut frontier, mut sent, mut carried) = (0u32, 0, 0);
+    let mut acknowledgements = std::collections::VecDeque::from([0; 6]);
+    let mut samples = Vec::new();
+    for i in 0..300 {
+        bench.forget();
+        let phase = 0.37 * f64::from(i);
+        let x = home() + Vector3::new(phase.sin(), (0.7 * phase).cos(), 0.0) * 0.3;
+        bench.sample(x);
+        samples.push((bench.now, x));
+        for motion in bench.motions() {
+            sent += 1;
+            carried += motion.knots.len();
+            if lost(sent) {
+                continue;
+            }
+            let Some(known) = frontier.checked_sub(motion.first_knot) else {
+                continue;
+            };
+            for knot in knots::unpack(&motion.state, grid, &motion.knots).skip(known as usize) {
+                path.append(&knot).unwrap();
+                frontier += 1;
+            }
+        }
+        acknowledgements.push_back(frontier);
+        let seen = acknowledgements.pop_front().unwrap_or_default();
+        if acknowledge {
+            bench.receives(&RobotDatagram::Telemetry(telemetry(i as u32, seen)));
+        }
+    }
+    let made = bench.session.counters().knots;
+    assert!(frontier + 4 >= made || !acknowledge, "{frontier} of {made}");
+    (path, samples, made, carried)
+}
+
+#[test]
+fn the_robot_ends_with_the_whole_path_whatever_is_lost() {
+    for (name, lost) in [
+        ("nothing", (|_| false) as fn(usize) -> bool),
+        ("every third", |n| n % 3 == 0),
+        ("bursts of four", |n| n % 12 < 4),
+    ] {
+        let (path, samples, made, carried) = streamed(lost, true);
+        assert!(made > 40, "{made}");
+        let frontier = path.frontier().unwrap();
+        let first = path.knots().next().unwrap().t;
+        let mut covered = 0;
+        for (t, x) in &samples {
+            let tick = Stamp((t.0 + TICK_NS / 2).div_euclid(TICK_NS) * TICK_NS);
+            if tick < first || tick > frontier {
+                continue;
+            }
+            covered += 1;
+            let error_m = (path.eval(tick).expect("no hole").x - x).norm();
+            assert!(error_m <= 0.005, "{name}: {error_m} m off");
+        }
+        assert!(covered > 280, "{name}: {covered} of 300 samples");
+        if name == "nothing" {
+            assert!(
+                carried <= 2 * made as usize,
+                "{carried} carried, {made} made"
+            );
+        }
+    }
+}
+
+#[test]
+fn what_is_not_acknowledged_is_sent_again() {
+    let (_, _, made, carried) = streamed(|_| false, false);
+    assert!(
+        carried > 3 * made as usize,
+        "{carried} carried, {made} made"
+    );
+}

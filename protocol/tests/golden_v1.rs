@@ -1,0 +1,350 @@
+//! The bytes of version 1, for ever: a message that no longer encodes to these needs a new version.
+
+use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
+use telemime_protocol::wire::state::WireState;
+use telemime_protocol::wire::v1::*;
+
+const STATE: WireState = WireState {
+    t_us: 1_234_567,
+    x: [1000, -2500, 25_000],
+    memory_exponent: 3,
+    memory: [[1, -1, 2], [-2, 3, -3], [40, -50, 60], [127, -128, 0]],
+};
+
+const PARAMS: WireParams = WireParams {
+    gain: 255,
+    trust: 200,
+    cv_damping: 128,
+};
+
+const ID: ModelId = [
+    0x10, 0x32, 0x54, 0x76, 0x98, 0xba, 0xdc, 0xfe, 0, 1, 2, 3, 4, 5, 6, 0xff,
+];
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+fn bytes(hex: &str) -> Vec<u8> {
+    let digit = |i: usize| u8::from_str_radix(&hex[i..i + 2], 16).expect("hexadecimal");
+    (0..hex.len()).step_by(2).map(digit).collect()
+}
+
+fn pinned<M: Message + PartialEq + std::fmt::Debug>(vectors: Vec<(M, &str)>) {
+    for (message, golden) in vectors {
+        let golden: String = golden.split_whitespace().collect();
+        assert_eq!(hex(&message.encode()), golden, "{message:?}");
+        assert_eq!(M::decode(&bytes(&golden)), Ok(message));
+    }
+}
+
+#[test]
+fn operator_control() {
+    let engage = |drive| {
+        OperatorControl::Engage(Engage {
+            engagement: 3,
+            drive,
+            scale: 0.125,
+            rotation: [0.5, -0.5, 0.5, 0.5],
+            path_bound_um: 20_000,
+            lease_ms: 650,
+        })
+    };
+    let mirror = Drive::Mirror {
+        state: STATE,
+        model: 0x3210,
+        params: PARAMS,
+    };
+    pinned(vec![
+        (
+            OperatorControl::Model {
+                id: ID,
+                bytes: vec![9, 8, 7],
+            },
+            "001032547698badcfe00010203040506ff03090807",
+        ),
+        (
+            OperatorControl::Plan {
+                id: 300,
+                bytes: vec![1, 2],
+            },
+            "01fb2c01020102",
+        ),
+        (
+            engage(mirror),
+            "020300fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ffc8800000003e \
+             0000003f000000bf0000003f0000003ffb204efb8a02",
+        ),
+        (
+            engage(Drive::Play { plan: 300 }),
+            "020301fb2c010000003e0000003f000000bf0000003f0000003ffb204efb8a02",
+        ),
+        (OperatorControl::Release { engagement: 3 }, "0303"),
+        (OperatorControl::EmergencyStop, "04"),
+        (OperatorControl::Reset, "05"),
+        (OperatorControl::Goodbye, "06"),
+    ]);
+}
+
+#[test]
+fn robot_control() {
+    let info = |model| {
+        RobotControl::Info(Info {
+            name: "mime7".into(),
+            joints: 7,
+            speed_m_s: 1.5,
+            accel_m_s2: 13.0,
+            radius_m: 0.25,
+            lag_s: 0.0625,
+            model,
+            state: RobotState::Holding,
+        })
+    };
+    pinned(vec![
+        (
+            info(None),
+            "00056d696d6537070000c03f000050410000803e0000803d0004",
+        ),
+        (
+            info(Some(ID)),
+            "00056d696d6537070000c03f000050410000803e0000803d011032547698badcfe00010203040506 \
+             ff04",
+        ),
+        (
+            RobotControl::ModelStored { id: ID },
+            "011032547698badcfe00010203040506ff",
+        ),
+        (RobotControl::PlanStored { id: 300 }, "02fb2c01"),
+        (
+            RobotControl::Engaged {
+                engagement: 3,
+                t_us: -1,
+                hand_m: [0.5, -0.25, 2.5],
+                tip_m: [0.5, 0.0, 0.5],
+            },
+            "0303010000003f000080be000020400000003f000000000000003f",
+        ),
+        (
+            RobotControl::Refused {
+                reason: Refusal::Diverged,
+            },
+            "0409",
+        ),
+        (
+            RobotControl::State {
+                state: RobotState::Coasting,
+                cause: Cause::NewsLate,
+            },
+            "050302",
+        ),
+    ]);
+}
+
+#[test]
+fn operator_datagrams() {
+    let motion = |checksum, knots| {
+        OperatorDatagram::Motion(Motion {
+            epoch: 1,
+            engagement: 3,
+            seq: 70_000,
+            lease_ms: 650,
+            model: 0x3210,
+            params: PARAMS,
+            checksum,
+            state: STATE,
+            first_knot: 250,
+            knots,
+        })
+    };
+    let knots = vec![
+        WireKnot {
+            dt: 1,
+            dx: [0, -1, 1],
+            v: [-64, 64, 0],
+        },
+        WireKnot {
+            dt: 6600,
+            dx: [i32::MAX, i32::MIN, 126],
+            v: [-126, 125, -125],
+        },
+    ];
+    pinned(vec![
+        (
+            motion(Some(0xdead_beef), knots),
+            "000103fc70110100fb8a02fb1032ffc88001fcefbeaddefc0ead2500fbd007fb8713fb50c30301ff \
+             02fe03fd28ce3c7f8000fa02010001027f8000fbc819fcfefffffffcfffffffffbfc00fbfb00faf9",
+        ),
+        (
+            motion(None, vec![]),
+            "000103fc70110100fb8a02fb1032ffc88000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
+             ce3c7f8000fa00",
+        ),
+        (
+            OperatorDatagram::Go {
+                epoch: 1,
+                engagement: 3,
+                seq: 251,
+                t_us: 1_234_567,
+                lease_ms: 650,
+            },
+            "010103fbfb00fc0ead2500fb8a02",
+        ),
+        (
+            OperatorDatagram::Pong {
+                epoch: 1,
+                t1_us: -5_000_000_000,
+                t2_us: 125,
+                t3_us: -126,
+            },
+            "0201fdffe30b5402000000fafbfb00",
+        ),
+        (OperatorDatagram::Stop { epoch: 65_536 }, "03fc00000100"),
+    ]);
+}
+
+#[test]
+fn robot_datagrams() {
+    let telemetry = Telemetry {
+        epoch: 1,
+        seq: 2,
+        state: RobotState::Engaged,
+        engagement: 3,
+        t_us: 1_234_567,
+        clock_uncertainty_us: 50_000,
+        age_ms: 110,
+        delay_ms: 105,
+        path_frontier: 250,
+        received: 251,
+        newest_seq: 252,
+        dropped: 4,
+        clamps: 5,
+        tick_mean_ns: 6_000,
+        tick_p99_ns: 70_000,
+        overruns: 6,
+        tip_m: [0.5, 0.0, -0.5],
+        q: vec![1.0, -2.0],
+    };
+    pinned(vec![
+        (
+            RobotDatagram::Ping {
+                epoch: 1,
+                t1_us: 1_234_567,
+            },
+            "0001fc0ead2500",
+        ),
+        (
+            RobotDatagram::Telemetry(telemetry),
+            "0101020203fc0ead2500fb50c36e69fafbfb00fbfc000405fb7017fc70110100060000003f000000 \
+             00000000bf020000803f000000c0",
+        ),
+    ]);
+}
+
+/// The numbers of states, causes and refusals, which other messages only show one of.
+#[test]
+fn enumerations() {
+    let states = [
+        RobotState::Idle,
+        RobotState::Ready,
+        RobotState::Engaged,
+        RobotState::Coasting,
+        RobotState::Holding,
+        RobotState::Stopped,
+    ];
+    let causes = [
+        Cause::Requested,
+        Cause::NewsArrived,
+        Cause::NewsLate,
+        Cause::LeaseExpired,
+        Cause::PlanFinished,
+        Cause::ConnectionLost,
+        Cause::OperatorStop,
+        Cause::LocalStop,
+        Cause::ClockStep,
+    ];
+    let refusals = [
+        Refusal::Stopped,
+        Refusal::AlreadyEngaged,
+        Refusal::OldEngagement,
+        Refusal::StaleReference,
+        Refusal::ClockUnknown,
+        Refusal::BadModel,
+        Refusal::BadPlan,
+        Refusal::BadMapping,
+        Refusal::Moving,
+        Refusal::Diverged,
+    ];
+    for (n, state) in states.into_iter().enumerate() {
+        let cause = Cause::Requested;
+        assert_eq!(
+            RobotControl::State { state, cause }.encode(),
+            [5, n as u8, 0]
+        );
+    }
+    for (n, cause) in causes.into_iter().enumerate() {
+        let state = RobotState::Idle;
+        assert_eq!(
+            RobotControl::State { state, cause }.encode(),
+            [5, 0, n as u8]
+        );
+    }
+    for (n, reason) in refusals.into_iter().enumerate() {
+        assert_eq!(RobotControl::Refused { reason }.encode(), [4, n as u8]);
+    }
+}
+
+#[test]
+fn greetings() {
+    let hello = Hello {
+        min: 1,
+        max: 0x0203,
+        features: 0x8000_0000_0000_0001,
+    };
+    assert_eq!(
+        hex(&hello.encode()),
+        "544c4d4d 01 0100 0302 0100000000000080".replace(' ', "")
+    );
+    let ack = Answer::Ack {
+        version: 1,
+        features: 2,
+        epoch: 0x0102_0304,
+    };
+    assert_eq!(
+        hex(&ack.encode()),
+        "544c4d4d 02 0100 0200000000000000 04030201".replace(' ', "")
+    );
+    for (code, number) in [
+        (RejectCode::Version, "0100"),
+        (RejectCode::Busy, "0200"),
+        (RejectCode::Malformed, "0300"),
+        (RejectCode::Other(0xabcd), "cdab"),
+    ] {
+        let text = "no".to_owned();
+        let golden = format!("544c4d4d03{number}026e6f");
+        assert_eq!(hex(&Answer::Reject { code, text }.encode()), golden);
+    }
+}
+
+/// Bytes that a decoder must refuse, each for its own reason.
+#[test]
+fn must_reject() {
+    for (why, control) in [
+        ("no such message", "07"),
+        ("nothing", ""),
+        ("cut", "03"),
+        ("trailing byte", "0400"),
+        ("long form of 3", "03fb0300"),
+        ("a length of 2^63", "010afdffffffffffffff7f"),
+    ] {
+        assert!(OperatorControl::decode(&bytes(control)).is_err(), "{why}");
+    }
+    for (why, datagram) in [
+        ("no such datagram", "04"),
+        ("long form of epoch 1", "03fb0100"),
+        ("trailing byte", "030100"),
+        ("cut", "01010304"),
+    ] {
+        assert!(OperatorDatagram::decode(&bytes(datagram)).is_err(), "{why}");
+    }
+    assert!(OperatorDatagram::decode(&bytes("0301")).is_ok());
+}

@@ -1,0 +1,499 @@
+//! The wire, from outside: whatever is sent comes back, and whatever arrives does no harm.
+
+use core::fmt::Debug;
+
+use nalgebra::Vector3;
+use proptest::collection::vec;
+use proptest::option;
+use proptest::prelude::*;
+use telemime_protocol::predict::{HandState, Params};
+use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::DecodeError;
+use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
+use telemime_protocol::wire::state::{MAX_POSITION_M, POSITION_STEP_M, WireState};
+use telemime_protocol::wire::v1::*;
+
+fn finite() -> impl Strategy<Value = f32> {
+    any::<f32>().prop_filter("finite", |v| v.is_finite())
+}
+
+fn positive() -> impl Strategy<Value = f32> {
+    any::<f32>().prop_filter("positive", |v| v.is_finite() && *v > 0.0)
+}
+
+fn state() -> impl Strategy<Value = WireState> {
+    let limit = (MAX_POSITION_M / POSITION_STEP_M) as i32;
+    let t_us = -i64::MAX / 1000..=i64::MAX / 1000;
+    (
+        t_us,
+        [-limit..=limit, -limit..=limit, -limit..=limit],
+        0..=20u8,
+        any::<[[i8; 3]; 4]>(),
+    )
+        .prop_map(|(t_us, x, memory_exponent, memory)| WireState {
+            t_us,
+            x,
+            memory_exponent,
+            memory,
+        })
+}
+
+fn params() -> impl Strategy<Value = WireParams> {
+    any::<[u8; 3]>().prop_map(|[gain, trust, cv_damping]| WireParams {
+        gain,
+        trust,
+        cv_damping,
+    })
+}
+
+fn unit() -> impl Strategy<Value = [f32; 4]> {
+    let quaternion = [-1.0..1.0f32, -1.0..1.0f32, -1.0..1.0f32, 0.1..1.0f32];
+    quaternion.prop_map(|q| {
+        let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt();
+        q.map(|v| v / norm)
+    })
+}
+
+fn engage() -> impl Strategy<Value = Engage> {
+    let drive = prop_oneof![
+        (state(), any::<u16>(), params()).prop_map(|(state, model, params)| Drive::Mirror {
+            state,
+            model,
+            params
+        }),
+        any::<u32>().prop_map(|plan| Drive::Play { plan }),
+    ];
+    (
+        any::<u32>(),
+        drive,
+        1e-6..10.0f32,
+        unit(),
+        1..=u32::MAX,
+        any::<u16>(),
+    )
+        .prop_map(
+            |(engagement, drive, scale, rotation, path_bound_um, lease_ms)| Engage {
+                engagement,
+                drive,
+                scale,
+                rotation,
+                path_bound_um,
+                lease_ms,
+            },
+        )
+}
+
+fn operator_control() -> impl Strategy<Value = OperatorControl> {
+    prop_oneof![
+        (any::<[u8; 16]>(), vec(any::<u8>(), 0..600))
+            .prop_map(|(id, bytes)| OperatorControl::Model { id, bytes }),
+        (any::<u32>(), vec(any::<u8>(), 0..600))
+            .prop_map(|(id, bytes)| OperatorControl::Plan { id, bytes }),
+        engage().prop_map(OperatorControl::Engage),
+        any::<u32>().prop_map(|engagement| OperatorControl::Release { engagement }),
+        Just(OperatorControl::EmergencyStop),
+        Just(OperatorControl::Reset),
+        Just(OperatorControl::Goodbye),
+    ]
+}
+
+fn robot_state() -> impl Strategy<Value = RobotState> {
+    prop::sample::select(vec![
+        RobotState::Idle,
+        RobotState::Ready,
+        RobotState::Engaged,
+        RobotState::Coasting,
+        RobotState::Holding,
+        RobotState::Stopped,
+    ])
+}
+
+fn cause() -> impl Strategy<Value = Cause> {
+    prop::sample::select(vec![
+        Cause::Requested,
+        Cause::NewsArrived,
+        Cause::NewsLate,
+        Cause::LeaseExpired,
+        Cause::PlanFinished,
+        Cause::ConnectionLost,
+        Cause::OperatorStop,
+        Cause::LocalStop,
+        Cause::ClockStep,
+    ])
+}
+
+fn refusal() -> impl Strategy<Value = Refusal> {
+    prop::sample::select(vec![
+        Refusal::Stopped,
+        Refusal::AlreadyEngaged,
+        Refusal::OldEngagement,
+        Refusal::StaleReference,
+        Refusal::ClockUnknown,
+        Refusal::BadModel,
+        Refusal::BadPlan,
+        Refusal::BadMapping,
+        Refusal::Moving,
+        Refusal::Diverged,
+    ])
+}
+
+fn robot_control() -> impl Strategy<Value = RobotControl> {
+    let info = (
+        "[a-zé ]{0,32}",
+        any::<u8>(),
+        [positive(), positive(), positive()],
+        0.0..=2.0f32,
+        option::of(any::<[u8; 16]>()),
+        robot_state(),
+    )
+        .prop_map(
+            |(name, joints, [speed_m_s, accel_m_s2, radius_m], lag_s, model, state)| {
+                RobotControl::Info(Info {
+                    name,
+                    joints,
+                    speed_m_s,
+                    accel_m_s2,
+                    radius_m,
+                    lag_s,
+                    model,
+                    state,
+                })
+            },
+        );
+    let three = || [finite(), finite(), finite()];
+    prop_oneof![
+        info,
+        any::<[u8; 16]>().prop_map(|id| RobotControl::ModelStored { id }),
+        any::<u32>().prop_map(|id| RobotControl::PlanStored { id }),
+        (any::<u32>(), any::<i64>(), three(), three()).prop_map(
+            |(engagement, t_us, hand_m, tip_m)| RobotControl::Engaged {
+                engagement,
+                t_us,
+                hand_m,
+                tip_m
+            }
+        ),
+        refusal().prop_map(|reason| RobotControl::Refused { reason }),
+        (robot_state(), cause()).prop_map(|(state, cause)| RobotControl::State { state, cause }),
+    ]
+}
+
+/// As many knots as fit whatever they are; of small ones [`MAX_KNOTS`] do.
+const FITTING_KNOTS: usize = 28;
+
+fn motion() -> impl Strategy<Value = Motion> {
+    let knot = (any::<u32>(), any::<[i32; 3]>(), any::<[i32; 3]>())
+        .prop_map(|(dt, dx, v)| WireKnot { dt, dx, v });
+    (
+        any::<[u32; 4]>(),
+        any::<[u16; 2]>(),
+        params(),
+        option::of(any::<u32>()),
+        state(),
+        vec(knot, 0..=FITTING_KNOTS),
+    )
+        .prop_map(
+            |(
+                [epoch, engagement, seq, first_knot],
+                [lease_ms, model],
+                params,
+                checksum,
+                state,
+                knots,
+            )| {
+                Motion {
+                    epoch,
+                    engagement,
+                    seq,
+                    lease_ms,
+                    model,
+                    params,
+                    checksum,
+                    state,
+                    first_knot,
+                    knots,
+                }
+            },
+        )
+}
+
+fn operator_datagram() -> impl Strategy<Value = OperatorDatagram> {
+    prop_oneof![
+        motion().prop_map(OperatorDatagram::Motion),
+        (any::<[u32; 3]>(), any::<i64>(), any::<u16>()).prop_map(
+            |([epoch, engagement, seq], t_us, lease_ms)| OperatorDatagram::Go {
+                epoch,
+                engagement,
+                seq,
+                t_us,
+                lease_ms
+            }
+        ),
+        (any::<u32>(), any::<[i64; 3]>()).prop_map(|(epoch, [t1_us, t2_us, t3_us])| {
+            OperatorDatagram::Pong {
+                epoch,
+                t1_us,
+                t2_us,
+                t3_us,
+            }
+        }),
+        any::<u32>().prop_map(|epoch| OperatorDatagram::Stop { epoch }),
+    ]
+}
+
+fn robot_datagram() -> impl Strategy<Value = RobotDatagram> {
+    let telemetry = (
+        any::<[u32; 12]>(),
+        any::<[u16; 2]>(),
+        any::<i64>(),
+        robot_state(),
+        [finite(), finite(), finite()],
+        vec(finite(), 0..=MAX_JOINTS),
+    )
+        .prop_map(|(n, [age_ms, delay_ms], t_us, state, tip_m, q)| {
+            RobotDatagram::Telemetry(Telemetry {
+                epoch: n[0],
+                seq: n[1],
+                state,
+                engagement: n[2],
+                t_us,
+                clock_uncertainty_us: n[3],
+                age_ms,
+                delay_ms,
+                path_frontier: n[4],
+                received: n[5],
+                newest_seq: n[6],
+                dropped: n[7],
+                clamps: n[8],
+                tick_mean_ns: n[9],
+                tick_p99_ns: n[10],
+                overruns: n[11],
+                tip_m,
+                q,
+            })
+        });
+    prop_oneof![
+        (any::<u32>(), any::<i64>())
+            .prop_map(|(epoch, t1_us)| RobotDatagram::Ping { epoch, t1_us }),
+        telemetry,
+    ]
+}
+
+/// Damage to an encoding: cut, prolonged, or bytes changed.
+#[derive(Debug, Clone)]
+struct Damage {
+    keep: prop::sample::Index,
+    tail: Vec<u8>,
+    changes: Vec<(prop::sample::Index, u8)>,
+}
+
+fn damage() -> impl Strategy<Value = Damage> {
+    let change = (any::<prop::sample::Index>(), any::<u8>());
+    (
+        any::<prop::sample::Index>(),
+        vec(any::<u8>(), 0..4),
+        vec(change, 0..4),
+    )
+        .prop_map(|(keep, tail, changes)| Damage {
+            keep,
+            tail,
+            changes,
+        })
+}
+
+impl Damage {
+    fn to(&self, bytes: &[u8]) -> Vec<u8> {
+        let mut bytes = bytes.to_vec();
+        // Half of the time nothing is cut.
+        let keep = self.keep.index(2 * bytes.len() + 1).min(bytes.len());
+        bytes.truncate(keep);
+        bytes.extend(&self.tail);
+        for (at, to) in &self.changes {
+            if !bytes.is_empty() {
+                let at = at.index(bytes.len());
+                bytes[at] = *to;
+            }
+        }
+        bytes
+    }
+}
+
+/// A message comes back; what was made of it decodes to nothing else than what it says.
+fn travels<M: Message + PartialEq + Debug>(
+    message: &M,
+    damage: &Damage,
+) -> Result<(), TestCaseError> {
+    let bytes = message.encode();
+    let back = M::decode(&bytes);
+    prop_assert_eq!(back.as_ref(), Ok(message));
+    honest::<M>(&damage.to(&bytes))
+}
+
+fn honest<M: Message>(bytes: &[u8]) -> Result<(), TestCaseError> {
+    if let Ok(message) = M::decode(bytes) {
+        prop_assert_eq!(message.encode(), bytes);
+    }
+    Ok(())
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 512, ..ProptestConfig::default() })]
+
+    #[test]
+    fn operator_control_travels(message in operator_control(), damage in damage()) {
+        travels(&message, &damage)?;
+    }
+
+    #[test]
+    fn robot_control_travels(message in robot_control(), damage in damage()) {
+        travels(&message, &damage)?;
+    }
+
+    #[test]
+    fn operator_datagrams_travel(message in operator_datagram(), damage in damage()) {
+        travels(&message, &damage)?;
+        prop_assert!(message.encode().len() <= MAX_DATAGRAM_LEN);
+    }
+
+    #[test]
+    fn robot_datagrams_travel(message in robot_datagram(), damage in damage()) {
+        travels(&message, &damage)?;
+        prop_assert!(message.encode().len() <= MAX_DATAGRAM_LEN);
+    }
+
+    #[test]
+    fn arbitrary_bytes_are_honest(bytes in vec(any::<u8>(), 0..300), kind in 0..8u8) {
+        let mut typed = bytes.clone();
+        if let Some(first) = typed.first_mut() {
+            *first = kind;
+        }
+        for bytes in [&bytes, &typed] {
+            honest::<OperatorControl>(bytes)?;
+            honest::<RobotControl>(bytes)?;
+            honest::<OperatorDatagram>(bytes)?;
+            honest::<RobotDatagram>(bytes)?;
+        }
+    }
+
+    #[test]
+    fn greetings_travel_and_damaged_ones_are_honest(
+        (a, b, features) in any::<(u16, u16, u64)>(),
+        (code, text) in (any::<u16>(), "[a-z é]{0,120}"),
+        damage in damage(),
+    ) {
+        let hello = Hello { min: a.min(b), max: a.max(b), features };
+        let bytes = hello.encode();
+        prop_assert_eq!(Hello::decode(&bytes), Ok(Some((hello, bytes.len()))));
+        let damaged = damage.to(&bytes);
+        if let Ok(Some((hello, used))) = Hello::decode(&damaged) {
+            prop_assert_eq!(hello.encode(), &damaged[..used]);
+        }
+        let code = match code { 1 => RejectCode::Version, 2 => RejectCode::Busy, 3 => RejectCode::Malformed, n => RejectCode::Other(n) };
+        for answer in [Answer::Ack { version: a, features, epoch: u32::from(b) }, Answer::Reject { code, text }] {
+            let bytes = answer.encode();
+            prop_assert_eq!(Answer::decode(&bytes), Ok(Some((answer, bytes.len()))));
+            let damaged = damage.to(&bytes);
+            if let Ok(Some((answer, used))) = Answer::decode(&damaged) {
+                prop_assert_eq!(answer.encode(), &damaged[..used]);
+            }
+        }
+    }
+
+    /// Position to 0.05 mm, time to half a microsecond, memories to half of their step: 1/254 of the largest
+    /// offset, or 12.5 µm if that is more; the memories' origin is itself rounded.
+    #[test]
+    fn a_state_travels_within_its_steps(
+        t_ns in -1_000_000_000_000_000i64..1_000_000_000_000_000,
+        x in prop::array::uniform3(-100.0..=100.0f64),
+        offsets in prop::array::uniform4(prop::array::uniform3(-1.0..1.0f64)),
+        reach_m in prop_oneof![Just(0.0), 1e-6..1e-3f64, 1e-3..10.0f64, 10.0..3000.0f64],
+    ) {
+        let x = Vector3::from(x);
+        let offsets = offsets.map(|o| Vector3::from(o) * reach_m);
+        let sent = HandState { t: Stamp(t_ns), x, memory: offsets.map(|o| x - o) };
+        let wire = WireState::quantise(&sent).expect("within range");
+        let back = wire.dequantise();
+        prop_assert!((back.t.0 - t_ns).abs() <= 500);
+        prop_assert!((back.x - x).amax() <= 0.5 * POSITION_STEP_M + 1e-12);
+        let largest = offsets.iter().map(|o| o.amax()).fold(0.0, f64::max);
+        let bound_m = (largest / 127.0).max(1.25e-5) + 1e-9;
+        for (memory, offset) in back.memory.iter().zip(&offsets) {
+            let error_m = (back.x - memory - offset).amax();
+            prop_assert!(error_m <= bound_m, "{error_m} m of {bound_m} m");
+        }
+        // Both ends predict from the same numbers: once rounded, always the same.
+        let again = WireState::quantise(&back).expect("still within range").dequantise();
+        prop_assert_eq!((again.t, again.x), (back.t, back.x));
+    }
+
+    #[test]
+    fn parameters_travel_within_half_a_step(v in prop::array::uniform3(0.0..=1.0f64)) {
+        let sent = Params { gain: v[0], trust: v[1], cv_damping: v[2] };
+        let wire = WireParams::quantise(&sent);
+        let back = wire.dequantise();
+        prop_assert!(back.checked().is_ok());
+        for (a, b) in [(sent.gain, back.gain), (sent.trust, back.trust), (sent.cv_damping, back.cv_damping)] {
+            prop_assert!((a - b).abs() <= 0.5 / 255.0 + 1e-12);
+        }
+        prop_assert_eq!(WireParams::quantise(&back), wire);
+    }
+}
+
+#[test]
+fn counts_beyond_their_limits_are_refused() {
+    let knot = WireKnot {
+        dt: 1,
+        dx: [1; 3],
+        v: [1; 3],
+    };
+    let motion = |knots: usize| {
+        let state = HandState::first(Stamp(0), Vector3::zeros());
+        OperatorDatagram::Motion(Motion {
+            epoch: 1,
+            engagement: 1,
+            seq: 1,
+            lease_ms: 1,
+            model: 0,
+            params: WireParams::quantise(&Params::DEFAULT),
+            checksum: None,
+            state: WireState::quantise(&state).expect("within range"),
+            first_knot: 0,
+            knots: vec![knot; knots],
+        })
+    };
+    let decoded = |knots| OperatorDatagram::decode(&motion(knots).encode());
+    assert_eq!(decoded(MAX_KNOTS), Ok(motion(MAX_KNOTS)));
+    assert!(matches!(
+        decoded(MAX_KNOTS + 1),
+        Err(DecodeError::Invalid {
+            field: "motion.knots",
+            ..
+        })
+    ));
+    let model = |len: usize| OperatorControl::Model {
+        id: [0; 16],
+        bytes: vec![0; len],
+    };
+    let decoded = |len| OperatorControl::decode(&model(len).encode());
+    assert!(decoded(MAX_MODEL_LEN).is_ok() && decoded(MAX_MODEL_LEN + 1).is_err());
+}
+
+#[test]
+fn a_state_that_no_integers_hold_is_not_sent() {
+    let at = |x: f64, m: f64| {
+        let mut state = HandState::first(Stamp(0), Vector3::new(x, 0.0, 0.0));
+        state.memory[3] = Vector3::new(0.0, m, 0.0);
+        WireState::quantise(&state)
+    };
+    assert!(at(100.0, 0.0).is_some() && at(-100.0, 3000.0).is_some());
+    for (x, m) in [
+        (100.1, 0.0),
+        (f64::NAN, 0.0),
+        (f64::INFINITY, 0.0),
+        (0.0, 4000.0),
+        (0.0, 1e300),
+        (0.0, f64::INFINITY),
+    ] {
+        assert_eq!(at(x, m), None, "{x} {m}");
+    }
+}

@@ -1,0 +1,171 @@
+//! A tick neither allocates nor frees, whatever it is told to do.
+
+use std::collections::BTreeSet;
+
+use allocation_counter::measure;
+use nalgebra::{UnitQuaternion, Vector3};
+use telemime_endpoint::Mono;
+use telemime_protocol::predict::{Forecast, HandState, Params};
+use telemime_protocol::skill::example;
+use telemime_protocol::spline::{BSpline, End};
+use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::v1::{Cause, RobotState};
+use telemime_robot::rig::{Rig, RigOptions};
+use telemime_robot::servo::{Core, Engagement, Handle, Order, Report, Source, Trajectory, rings};
+
+const MS: i64 = 1_000_000;
+
+struct Bench {
+    core: Core,
+    handle: Handle,
+    now: Mono,
+    seen: BTreeSet<String>,
+    touched: u64,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let rig = Rig::load(&RigOptions::default()).unwrap();
+        let (rings, handle) = rings();
+        Self {
+            core: rig.servo(rings),
+            handle,
+            now: Mono(0),
+            seen: BTreeSet::new(),
+            touched: 0,
+        }
+    }
+
+    fn order(&mut self, order: Order) {
+        self.handle.orders.push(order).unwrap();
+    }
+
+    /// Ticks for `ms` and returns the last report; the session's end of the rings is left alone.
+    fn tick(&mut self, ms: i64) -> Report {
+        let mut last = None;
+        for _ in 0..ms {
+            self.now = Mono(self.now.0 + MS);
+            let (core, now) = (&mut self.core, self.now);
+            let used = measure(|| last = Some(core.tick(now)));
+            self.touched += used.count_total + used.count_current.unsigned_abs();
+            let state = last.as_ref().map(|r| r.state);
+            self.seen.insert(format!("{state:?}"));
+        }
+        last.unwrap()
+    }
+
+    fn engage(&mut self, number: u32, source: Source) {
+        self.order(Order::Engage(Engagement {
+            number,
+            source,
+            scale: 0.1,
+            rotation: UnitQuaternion::identity(),
+            lease_s: 0.65,
+        }));
+    }
+
+    /// What the hand's newest sample, valid now, predicts.
+    fn forecast(&self, with_model: bool) -> Forecast {
+        let t_s = self.now.0 as f64 * 1e-9;
+        let hand = |t_s: f64| Vector3::new((5.0 * t_s).sin(), (3.0 * t_s).cos(), 2.0) * 0.5;
+        let mut state = HandState::first(Stamp::ZERO, hand(t_s - 1.0));
+        for i in 1..=30 {
+            let u = f64::from(i) / 30.0;
+            state.advance(Stamp::from_secs_f64(u), hand(t_s - 1.0 + u));
+        }
+        if with_model {
+            example(3, 24)
+                .predictor()
+                .forecast(&state, &Params::DEFAULT)
+        } else {
+            Forecast::constant_velocity(&state, &Params::DEFAULT)
+        }
+    }
+}
+
+fn trajectory(duration_s: f64) -> Source {
+    let t: Vec<f64> = (0..10).map(|i| duration_s * f64::from(i) / 9.0).collect();
+    let x: Vec<_> = t
+        .iter()
+        .map(|t| Vector3::new(t.sin(), 0.2 * t, 0.0))
+        .collect();
+    Source::Play(Box::new(Trajectory {
+        spline: BSpline::interpolate(&t, &x, End::Natural).unwrap(),
+        duration_s,
+    }))
+}
+
+#[test]
+fn the_counter_counts() {
+    let used = measure(|| drop(std::hint::black_box(Box::new(1_u64))));
+    assert_eq!((used.count_total, used.count_current), (1, 0));
+}
+
+#[test]
+fn a_tick_never_touches_the_heap() {
+    let mut bench = Bench::new();
+    bench.tick(5);
+    bench.order(Order::Operator(true));
+    bench.tick(5);
+
+    let (forecast, valid_at) = (bench.forecast(false), bench.now);
+    bench.engage(1, Source::Mirror { forecast, valid_at });
+    for i in 0..60 {
+        bench.tick(33);
+        let (forecast, valid_at) = (bench.forecast(i % 2 == 0), bench.now);
+        bench.order(Order::Track {
+            forecast,
+            valid_at,
+            lease_s: 0.65,
+        });
+    }
+    let moving = bench.tick(10);
+    assert!(moving.state == RobotState::Engaged && moving.moving);
+    let held = bench.tick(1500);
+    assert_eq!(
+        (held.state, held.cause),
+        (RobotState::Holding, Cause::LeaseExpired)
+    );
+
+    // A plan to its end, one that takes the place of another, and one that is refused.
+    bench.engage(2, trajectory(0.5));
+    let mut played = bench.tick(400);
+    bench.order(Order::Extend { lease_s: 0.65 });
+    bench.engage(3, trajectory(0.5));
+    for _ in 0..10 {
+        played = bench.tick(100);
+        bench.order(Order::Extend { lease_s: 0.65 });
+    }
+    assert_eq!(
+        (played.state, played.cause),
+        (RobotState::Ready, Cause::PlanFinished)
+    );
+    bench.engage(4, trajectory(2.0));
+    bench.tick(300);
+    bench.order(Order::Hold(Cause::ClockStep));
+    assert_eq!(bench.tick(700).state, RobotState::Holding);
+
+    let (forecast, valid_at) = (bench.forecast(true), bench.now);
+    bench.engage(5, Source::Mirror { forecast, valid_at });
+    bench.tick(300);
+    bench.order(Order::Release);
+    bench.tick(500);
+    bench.order(Order::Stop(Cause::OperatorStop));
+    bench.tick(10);
+    bench.order(Order::Reset { operator: true });
+    bench.tick(10);
+    bench.order(Order::Operator(false));
+    assert_eq!(bench.tick(10).state, RobotState::Idle);
+
+    assert_eq!(bench.seen.len(), 6, "every state: {:?}", bench.seen);
+    assert_eq!(bench.handle.spent.slots(), 3, "plans are freed elsewhere");
+    assert_eq!(
+        bench.handle.reports.slots(),
+        4096,
+        "a full ring costs nothing"
+    );
+    assert_eq!(
+        bench.touched, 0,
+        "allocations and deallocations on the tick"
+    );
+}
