@@ -80,3 +80,37 @@ fn the_top_level_holds_what_was_agreed() {
         "unexpected {unexpected:?}, missing {missing:?}"
     );
 }
+
+/// All Rust code below `folder`.
+fn code(folder: &Path, into: &mut String) {
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            code(&path, into);
+        } else if path.extension().is_some_and(|e| e == "rs") {
+            into.push_str(&fs::read_to_string(path).unwrap());
+        }
+    }
+}
+
+#[test]
+fn every_test_that_the_safety_document_names_exists() {
+    let mut all = String::new();
+    for folder in ["operator", "protocol", "robot", "sim", "src", "tests"] {
+        code(&root().join(folder), &mut all);
+    }
+    let text = fs::read_to_string(root().join("docs/safety.md")).unwrap();
+    let named: BTreeSet<_> = text
+        .split('`')
+        .filter(|name| {
+            name.matches('_').count() >= 3
+                && name.chars().all(|c| c == '_' || c.is_ascii_alphanumeric())
+        })
+        .collect();
+    assert!(named.len() > 10, "{named:?}");
+    let missing: Vec<_> = named
+        .iter()
+        .filter(|name| !all.contains(&format!("fn {name}(")))
+        .collect();
+    assert!(missing.is_empty(), "no test is called {missing:?}");
+}

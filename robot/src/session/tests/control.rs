@@ -281,7 +281,7 @@ fn a_stop_is_ordered_and_confirmed_even_on_top_of_a_stop() {
         state: RobotState::Stopped,
         cause: Cause::OperatorStop,
     };
-    assert_eq!(bench.control, [confirmation.clone()]);
+    assert_eq!(bench.control, std::slice::from_ref(&confirmation));
     bench.forget();
 
     bench.control(&OperatorControl::EmergencyStop);
