@@ -21,6 +21,10 @@ use crate::session::{Counters, Output, Session, SessionConfig, TickTiming};
 /// How often reports are taken from the servo's ring.
 const DRAIN: Duration = Duration::from_millis(4);
 
+/// Close codes (docs/protocol.md): an ordinary end, and a malformed control message.
+const CLOSED: u32 = 0;
+const MALFORMED: u32 = 1;
+
 /// Connections that may be greeting at the same time.
 const MAX_GREETING: usize = 8;
 
@@ -101,7 +105,7 @@ impl Daemon {
         loop {
             let ended = self.flush(active.as_mut()).await;
             if let Some(why) = ended {
-                self.end(&mut active, &mut skill, &why, &notices);
+                self.end(&mut active, &mut skill, (why.0, &why.1), &notices);
             }
             let due = active
                 .as_ref()
@@ -115,7 +119,7 @@ impl Daemon {
                 }),
                 _ = drain.tick() => self.drain(active.as_mut(), &notices),
                 why = receive(active.as_mut(), &self.clock) => if let Some(why) = why {
-                    self.end(&mut active, &mut skill, &why, &notices);
+                    self.end(&mut active, &mut skill, (why.0, &why.1), &notices);
                 },
                 () = sleep_until(due.unwrap_or_else(tokio::time::Instant::now)), if due.is_some() => {
                     if let Some(active) = &mut active {
@@ -144,7 +148,12 @@ impl Daemon {
             let _ = active.send.finish();
             let _ = tokio::time::timeout(Duration::from_millis(500), active.send.stopped()).await;
         }
-        self.end(&mut active, &mut skill, "the robot daemon stops", &notices);
+        self.end(
+            &mut active,
+            &mut skill,
+            (CLOSED, "the robot daemon stops"),
+            &notices,
+        );
         self.endpoint
             .close(VarInt::from_u32(0), b"the robot daemon stops");
         self.endpoint.wait_idle().await;
@@ -258,19 +267,19 @@ impl Daemon {
     }
 
     /// Does what the session wants; a reason if the session is over.
-    async fn flush(&mut self, active: Option<&mut Active>) -> Option<String> {
+    async fn flush(&mut self, active: Option<&mut Active>) -> Option<(u32, String)> {
         let active = active?;
         while let Some(output) = active.session.poll_output() {
             match output {
                 Output::Control(payload) => {
                     if let Err(e) = write_frame(&mut active.send, &payload).await {
-                        return Some(e.to_string());
+                        return Some((CLOSED, e.to_string()));
                     }
                 }
                 // Too large or unsupported cannot happen (1100 B); a lost connection shows up in `receive`.
                 Output::Datagram(bytes) => drop(active.connection.send_datagram(bytes.into())),
                 Output::Order(order) => self.order(order),
-                Output::Goodbye => return Some("the operator said goodbye".into()),
+                Output::Goodbye => return Some((CLOSED, "the operator said goodbye".into())),
             }
         }
         None
@@ -280,7 +289,7 @@ impl Daemon {
         &mut self,
         active: &mut Option<Active>,
         skill: &mut Option<Arc<Skill>>,
-        why: &str,
+        (code, why): (u32, &str),
         notices: &mpsc::UnboundedSender<Notice>,
     ) {
         let Some(mut ended) = active.take() else {
@@ -292,7 +301,9 @@ impl Daemon {
                 self.order(order);
             }
         }
-        ended.connection.close(VarInt::from_u32(0), why.as_bytes());
+        ended
+            .connection
+            .close(VarInt::from_u32(code), why.as_bytes());
         if let Some(held) = ended.session.skill() {
             *skill = Some(held);
         }
@@ -318,7 +329,7 @@ impl Daemon {
 }
 
 /// The next thing the operator sends; a reason if it is the last. Never resolves without an operator.
-async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<String> {
+async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<(u32, String)> {
     let Some(active) = active else {
         return std::future::pending().await;
     };
@@ -326,17 +337,17 @@ async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<Strin
         biased;
         frame = active.frames.recv() => match frame {
             Some(Ok(frame)) => {
-                active.session.handle_control(clock.now(), &frame).err().map(|e| format!("control message: {e}"))
+                active.session.handle_control(clock.now(), &frame).err().map(|e| (MALFORMED, format!("control message: {e}")))
             }
-            Some(Err(e)) => Some(e.to_string()),
-            None => Some("control stream ended".into()),
+            Some(Err(e)) => Some((CLOSED, e.to_string())),
+            None => Some((CLOSED, "control stream ended".into())),
         },
         datagram = active.connection.read_datagram() => match datagram {
             Ok(bytes) => {
                 active.session.handle_datagram(clock.now(), &bytes);
                 None
             }
-            Err(e) => Some(quic::explain(&e)),
+            Err(e) => Some((CLOSED, quic::explain(&e))),
         },
     }
 }

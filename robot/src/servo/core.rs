@@ -119,6 +119,8 @@ pub struct Report {
     pub engagement: u32,
     /// When it began.
     pub engaged_at: Mono,
+    /// The engagement declined last, and when: the arm had begun to move, or a stop came first.
+    pub declined: (u32, Mono),
     /// Its mapping.
     pub mapping: Mapping,
     /// The arm still moves.
@@ -212,6 +214,7 @@ pub struct Core {
     mapping: Mapping,
     engagement: u32,
     engaged_at: Mono,
+    declined: (u32, Mono),
     clamps: u32,
     out_of_reach: bool,
     tick: u64,
@@ -241,6 +244,7 @@ impl Core {
             mapping,
             engagement: 0,
             engaged_at: Mono(0),
+            declined: (0, Mono(i64::MIN)),
             clamps: 0,
             out_of_reach: false,
             tick: 0,
@@ -314,6 +318,7 @@ impl Core {
             Source::Play(trajectory) => Drive::Play(trajectory),
         };
         if self.moving || !self.safety.engage(now, engagement.lease_s) {
+            self.declined = (engagement.number, now);
             self.discard(drive);
             return;
         }
@@ -393,6 +398,7 @@ impl Core {
             transitions: self.safety.transitions(),
             engagement: self.engagement,
             engaged_at: self.engaged_at,
+            declined: self.declined,
             mapping: self.mapping,
             moving: self.moving,
             age_s,

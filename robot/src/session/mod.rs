@@ -280,6 +280,16 @@ impl Session {
                 tip_m: report.mapping.tip_m.cast::<f32>().into(),
             });
         }
+        if self.acknowledged != self.engagement
+            && report.declined.0 == self.engagement
+            && report.declined.1 >= self.requested_at
+        {
+            self.acknowledged = self.engagement;
+            self.refuse(match report.state {
+                RobotState::Stopped => Refusal::Stopped,
+                _ => Refusal::Moving,
+            });
+        }
         if changed {
             self.send(&RobotControl::State {
                 state: report.state,

@@ -88,6 +88,25 @@ fn another_sessions_engagement_of_the_same_number_is_no_acknowledgement() {
 }
 
 #[test]
+fn an_engage_the_servo_declines_is_answered() {
+    let mut bench = Bench::ready(None);
+    let engage = bench.mirror(1);
+    bench.engage(&engage);
+    bench.forget();
+    let declined = |at| Report {
+        declined: (1, at),
+        moving: true,
+        ..report(RobotState::Ready)
+    };
+    bench.report(&declined(Mono(bench.now.0 - 5000 * MS)));
+    assert_eq!(bench.control, [], "another session's");
+    bench.report(&declined(bench.now));
+    bench.report(&declined(bench.now));
+    let reason = Refusal::Moving;
+    assert_eq!(bench.control, [RobotControl::Refused { reason }]);
+}
+
+#[test]
 fn the_arms_state_decides_whether_it_may_engage() {
     let mut bench = Bench::fresh(None);
     for _ in 0..4 {
