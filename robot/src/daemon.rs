@@ -10,7 +10,7 @@ use telemime_endpoint::{HostClock, quic};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode, negotiate};
-use telemime_protocol::wire::v1::{self, Cause, Info};
+use telemime_protocol::wire::v1::{self, Cause, Info, RobotState};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep_until};
 
@@ -24,6 +24,9 @@ const DRAIN: Duration = Duration::from_millis(4);
 /// Close codes (docs/protocol.md): an ordinary end, and a malformed control message.
 const CLOSED: u32 = 0;
 const MALFORMED: u32 = 1;
+
+/// A stop takes a fraction of a second; after this many drains (2 s) the servo itself must be dead.
+const MAX_STOP_DRAINS: u32 = 500;
 
 /// Connections that may be greeting at the same time.
 const MAX_GREETING: usize = 8;
@@ -117,7 +120,9 @@ impl Daemon {
                     Word::Stop => Order::Stop(Cause::LocalStop),
                     Word::Reset => Order::Reset { operator: active.is_some() },
                 }),
-                _ = drain.tick() => self.drain(active.as_mut(), &notices),
+                _ = drain.tick() => {
+                    self.drain(active.as_mut(), &notices);
+                }
                 why = receive(active.as_mut(), &self.clock) => if let Some(why) = why {
                     self.end(&mut active, &mut skill, (why.0, &why.1), &notices);
                 },
@@ -140,11 +145,20 @@ impl Daemon {
             }
         }
         self.order(Order::Stop(Cause::LocalStop));
+        // Nobody leaves before the arm is at rest; the operator hears of the stop at once.
+        for _ in 0..MAX_STOP_DRAINS {
+            sleep_until(
+                self.clock
+                    .instant(self.clock.now().offset_by_secs(DRAIN.as_secs_f64())),
+            )
+            .await;
+            let at_rest = self.drain(active.as_mut(), &notices);
+            let _ = self.flush(active.as_mut()).await;
+            if at_rest {
+                break;
+            }
+        }
         if let Some(active) = &mut active {
-            // One last drain, so that the operator hears of the stop.
-            self.clock_tick().await;
-            self.drain(Some(active), &notices);
-            let _ = self.flush(Some(active)).await;
             let _ = active.send.finish();
             let _ = tokio::time::timeout(Duration::from_millis(500), active.send.stopped()).await;
         }
@@ -157,14 +171,6 @@ impl Daemon {
         self.endpoint
             .close(VarInt::from_u32(0), b"the robot daemon stops");
         self.endpoint.wait_idle().await;
-    }
-
-    async fn clock_tick(&self) {
-        sleep_until(
-            self.clock
-                .instant(self.clock.now().offset_by_secs(2.0 * DRAIN.as_secs_f64())),
-        )
-        .await;
     }
 
     /// Gives authority, or says why not.
@@ -244,7 +250,13 @@ impl Daemon {
         let _ = self.servo.orders.push(order);
     }
 
-    fn drain(&mut self, mut active: Option<&mut Active>, notices: &mpsc::UnboundedSender<Notice>) {
+    /// Takes the servo's reports; says whether the newest is of an arm stopped and at rest.
+    fn drain(
+        &mut self,
+        mut active: Option<&mut Active>,
+        notices: &mpsc::UnboundedSender<Notice>,
+    ) -> bool {
+        let mut at_rest = false;
         let timing = self
             .timing
             .as_deref()
@@ -258,12 +270,14 @@ impl Daemon {
             });
         while let Ok(report) = self.servo.reports.pop() {
             self.info.state = report.state;
+            at_rest = report.state == RobotState::Stopped && !report.moving;
             if let Some(active) = active.as_deref_mut() {
                 active.session.handle_report(&report, timing);
             }
             let _ = notices.send(Notice::Report(Box::new(report)));
         }
         while self.servo.spent.pop().is_ok() {}
+        at_rest
     }
 
     /// Does what the session wants; a reason if the session is over.
