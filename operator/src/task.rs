@@ -140,10 +140,13 @@ impl Task {
 
     /// The connection was lost: the arm holds, and nothing here engages it again.
     pub fn on_lost(&mut self, why: &str) {
-        if matches!(self.phase, Phase::Asked | Phase::Engaged) {
-            self.give_up(format!(
+        match self.phase {
+            Phase::Asked | Phase::Engaged => self.give_up(format!(
                 "the link was lost ({why}); the arm holds and is not engaged again by itself"
-            ));
+            )),
+            // The next session is asked as soon as it is there.
+            Phase::Waiting(_) => self.phase = Phase::Waiting(None),
+            Phase::Leaving(_) | Phase::Over => {}
         }
     }
 
@@ -224,10 +227,10 @@ impl Task {
 
     /// When [`Task::advise`] has something to do next.
     pub fn poll_timeout(&self) -> Option<Stamp> {
-        let retry = if let Phase::Waiting(at) = self.phase {
-            at
-        } else {
-            None
+        // A replay asks with its next sample; only a plan is asked for by the clock.
+        let retry = match (&self.work, self.phase) {
+            (Work::Play { .. }, Phase::Waiting(at)) => at,
+            _ => None,
         };
         let leave = if let Phase::Leaving(at) = self.phase {
             Some(at)
@@ -291,3 +294,6 @@ fn sample_at(recording: &Recording, i: usize, started: Stamp) -> Option<HandSamp
         x: *x,
     })
 }
+
+#[cfg(test)]
+mod tests;

@@ -294,6 +294,14 @@ impl Pair {
         host(1)
     }
 
+    /// Changes the links of the `operator`th operator, the first being 1, both ways.
+    pub fn set_link(&self, operator: u8, link: &LinkConfig, seed: u64) {
+        let own = host(1 + operator);
+        self.network.link(own, host(1), link.clone(), seed);
+        self.network
+            .link(host(1), own, link.clone(), seed ^ 0x9e37_79b9_7f4a_7c15);
+    }
+
     fn client(
         &mut self,
         identity: &Identity,
@@ -302,9 +310,7 @@ impl Pair {
     ) -> Result<(quinn::Endpoint, Meter), PairError> {
         self.operators += 1;
         let own = host(1 + self.operators);
-        self.network.link(own, host(1), link.clone(), seed);
-        self.network
-            .link(host(1), own, link.clone(), seed ^ 0x9e37_79b9_7f4a_7c15);
+        self.set_link(self.operators, link, seed);
         let meter = Meter::default();
         let socket = quic::Socket::Abstract {
             socket: self.network.socket(own),

@@ -1,0 +1,105 @@
+use telemime_protocol::checkpoint::select;
+use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::v1::{Info, Message, RobotControl};
+
+use super::*;
+use crate::session::SessionConfig;
+
+fn ready() -> Session {
+    let mut session = Session::new(SessionConfig::default(), None, 1);
+    let info = Info {
+        name: "bench".into(),
+        joints: 7,
+        speed_m_s: 1.7,
+        accel_m_s2: 13.0,
+        radius_m: 0.3,
+        lag_s: 0.07,
+        model: None,
+        state: RobotState::Ready,
+    };
+    let frame = Frame {
+        ignorable: false,
+        payload: RobotControl::Info(info).encode(),
+    };
+    session.handle_control(Stamp::ZERO, &frame).unwrap();
+    session
+}
+
+fn at(ms: i64) -> Stamp {
+    Stamp(ms * 1_000_000)
+}
+
+fn points() -> Vec<(f64, Vector3<f64>)> {
+    let point = |i: i32| (f64::from(i) * 0.033, Vector3::x() * (0.01 * f64::from(i)));
+    (0..60).map(point).collect()
+}
+
+fn replay() -> Task {
+    Task::replay(Recording {
+        samples: points(),
+        rest_s: 0.0,
+    })
+}
+
+fn play() -> Task {
+    let (t, x): (Vec<f64>, Vec<_>) = points().into_iter().unzip();
+    Task::play(select::bounded(&t, &x, 0.01).unwrap())
+}
+
+/// A shell sleeps until what [`Task::poll_timeout`] names, and advises: it must not find itself there again.
+#[test]
+fn what_is_due_is_over_once_it_was_done() {
+    for mut task in [replay(), play()] {
+        let mut session = ready();
+        let (mut now, mut asked) = (at(0), 0);
+        while now < at(1000) {
+            task.advise(now, &mut session);
+            if task.phase == Phase::Asked {
+                asked += 1;
+                task.on_event(now, &Event::Refused(Refusal::ClockUnknown));
+            }
+            let due = task.poll_timeout().expect("a retry or a sample");
+            assert!(due > now, "{now:?}: due again at {due:?}");
+            now = due;
+        }
+        assert!((10..=20).contains(&asked), "{asked} requests in a second");
+    }
+}
+
+#[test]
+fn a_lost_link_leaves_nothing_due_until_the_robot_is_back() {
+    let mut task = play();
+    task.advise(at(0), &mut ready());
+    task.on_event(at(10), &Event::Refused(Refusal::Moving));
+    task.on_lost("test");
+    assert_eq!(task.poll_timeout(), None);
+    assert!(!task.is_over(at(2000)));
+    let mut fresh = Session::new(SessionConfig::default(), None, 2);
+    task.advise(at(2000), &mut fresh);
+    assert_eq!(task.poll_timeout(), None);
+    task.advise(at(2100), &mut ready());
+    assert_eq!(task.phase, Phase::Asked);
+}
+
+#[test]
+fn after_a_hold_or_a_stop_nothing_is_asked_again() {
+    for event in [
+        Event::State(RobotState::Holding, Cause::LeaseExpired),
+        Event::State(RobotState::Stopped, Cause::LocalStop),
+    ] {
+        let (mut task, mut session) = (replay(), ready());
+        let mut now = at(0);
+        task.advise(now, &mut session);
+        assert_eq!(task.phase, Phase::Asked);
+        task.on_event(now, &event);
+        while let Some(due) = task.poll_timeout() {
+            now = due;
+            assert_ne!(task.phase, Phase::Asked);
+            if task.advise(now, &mut session) == Advice::Finished {
+                break;
+            }
+        }
+        assert!(matches!(task.outcome(false), Outcome::Interrupted(_)));
+        assert!(now > at(1900), "the samples go on: {now:?}");
+    }
+}
