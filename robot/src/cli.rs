@@ -15,7 +15,7 @@ use tokio::sync::mpsc;
 use crate::control::ControlConfig;
 use crate::daemon::{Daemon, Notice};
 use crate::rig::{Rig, RigOptions};
-use crate::servo::{self, Report};
+use crate::servo::{self, Report, Ticket};
 use crate::session::SessionConfig;
 
 /// Drive an arm for an operator.
@@ -228,14 +228,14 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
             )
         },
     );
-    let daemon = Daemon {
+    let daemon = Daemon::new(
         endpoint,
-        clock: HostClock::new(),
-        info: rig.info(),
-        config: SessionConfig::default(),
-        servo: handle,
-        timing: Some(running.timing.clone()),
-    };
+        HostClock::new(),
+        rig.info(),
+        SessionConfig::default(),
+        handle,
+        Some(running.timing.clone()),
+    );
     let (notices, heard) = mpsc::unbounded_channel();
     let listener = tokio::spawn(listen_to(heard, log, recorder));
     daemon.run(quit, words, notices).await;
@@ -290,7 +290,7 @@ async fn listen_to(
     log: Log,
     mut recorder: Option<Recorder>,
 ) -> Option<Recorder> {
-    let (mut transitions, mut engagement) = (None, 0);
+    let (mut transitions, mut engagement) = (None, Ticket::default());
     while let Some(notice) = heard.recv().await {
         match notice {
             Notice::Report(report) => {
@@ -314,11 +314,13 @@ async fn listen_to(
                 if report.engagement != engagement {
                     engagement = report.engagement;
                     log.say(&engaged(&report), || {
-                        format!("engaged #{engagement} at scale {:.3}", report.mapping.scale)
+                        format!(
+                            "engaged #{} at scale {:.3}",
+                            engagement.number, report.mapping.scale
+                        )
                     });
                 }
             }
-            // Engagements count per session.
             Notice::Connected { epoch, peer } => {
                 log.say(&Event::Connected { epoch, peer }, || {
                     format!("operator {peer} (session {epoch})")
@@ -359,7 +361,7 @@ async fn listen_to(
 fn engaged(report: &Report) -> Event {
     let q = report.mapping.rotation.as_ref();
     Event::Engaged {
-        engagement: report.engagement,
+        engagement: report.engagement.number,
         mono_ns: report.engaged_at.0,
         scale: report.mapping.scale,
         rotation: [q.w, q.i, q.j, q.k],
@@ -390,7 +392,7 @@ impl Recorder {
             (0..dof).try_for_each(|i| write!(out, ",q{i}"))?;
             writeln!(out)?;
             for r in reports {
-                write!(out, "{},{:?},{},{:.6},{}", r.at.0, r.state, r.engagement, r.age_s, r.clamps)?;
+                write!(out, "{},{:?},{},{:.6},{}", r.at.0, r.state, r.engagement.number, r.age_s, r.clamps)?;
                 r.tip_m.iter().chain(&r.target_m).try_for_each(|v| write!(out, ",{v:.6}"))?;
                 r.q.iter().take(dof).try_for_each(|v| write!(out, ",{v:.6}"))?;
                 writeln!(out)?;

@@ -5,13 +5,14 @@ use std::time::Duration;
 
 use quinn::{Connection, Endpoint, Incoming, SendStream, VarInt};
 use telemime_endpoint::cli::{Word, told};
-use telemime_endpoint::control::{Control, ControlError, write_frame};
+use telemime_endpoint::control::{Control, ControlError};
 use telemime_endpoint::{HostClock, quic};
 use telemime_protocol::skill::Skill;
-use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::frame::{self, Frame};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode, negotiate};
 use telemime_protocol::wire::v1::{self, Cause, Info, RobotState};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
+use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval, sleep_until};
 
 use crate::servo::thread::Timing;
@@ -21,9 +22,21 @@ use crate::session::{Counters, Output, Session, SessionConfig, TickTiming};
 /// How often reports are taken from the servo's ring.
 const DRAIN: Duration = Duration::from_millis(4);
 
-/// Close codes (docs/protocol.md): an ordinary end, and a malformed control message.
+/// Close codes (docs/protocol.md §1).
 const CLOSED: u32 = 0;
 const MALFORMED: u32 = 1;
+const REJECTED: u32 = 2;
+const MALFORMED_GREETING: u32 = 3;
+const FAULT: u32 = 4;
+
+/// What is still to be said when a session ends gets this long.
+const LAST_WORDS: Duration = Duration::from_millis(500);
+
+/// Control messages an operator may leave unread.
+const MAX_UNREAD: usize = 256;
+
+/// Drains (0.5 s) without a word from the servo.
+const MAX_SILENT_DRAINS: u32 = 125;
 
 /// A stop takes a fraction of a second; after this many drains (2 s) the servo itself must be dead.
 const MAX_STOP_DRAINS: u32 = 500;
@@ -35,17 +48,18 @@ const MAX_GREETING: usize = 8;
 #[derive(Debug)]
 pub struct Daemon {
     /// A server endpoint that knows which keys to accept.
-    pub endpoint: Endpoint,
+    endpoint: Endpoint,
     /// The host's clock.
-    pub clock: HostClock,
+    clock: HostClock,
     /// What operators are told of the arm.
-    pub info: Info,
+    info: Info,
     /// Session settings.
-    pub config: SessionConfig,
+    config: SessionConfig,
     /// The servo's rings.
-    pub servo: Handle,
+    servo: Handle,
     /// The servo's timing, where it has a thread of its own.
-    pub timing: Option<Arc<Timing>>,
+    timing: Option<Arc<Timing>>,
+    silent_drains: u32,
 }
 
 /// Something for a log.
@@ -87,26 +101,57 @@ struct Greeted {
 struct Active {
     session: Session,
     connection: Connection,
-    send: SendStream,
+    /// Towards the operator, written by a task of its own: who does not read holds up nobody.
+    writer: mpsc::Sender<Vec<u8>>,
+    written: JoinHandle<()>,
     frames: mpsc::Receiver<Result<Frame, ControlError>>,
 }
 
+/// The servo has not reported for half a second: nothing drives the arm any more.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("the servo has stopped; see above for why, and start the robot again")]
+pub struct ServoDead;
+
 impl Daemon {
+    /// A daemon that serves `endpoint` and drives `servo`, whose timing is `timing` if it has a thread of its own.
+    pub fn new(
+        endpoint: Endpoint,
+        clock: HostClock,
+        info: Info,
+        config: SessionConfig,
+        servo: Handle,
+        timing: Option<Arc<Timing>>,
+    ) -> Self {
+        Self {
+            endpoint,
+            clock,
+            info,
+            config,
+            servo,
+            timing,
+            silent_drains: 0,
+        }
+    }
+
     /// Serves operators until `quit` turns true; then the arm is stopped (latched) and the endpoint closed.
+    ///
+    /// # Errors
+    /// [`ServoDead`].
     pub async fn run(
         mut self,
         mut quit: watch::Receiver<bool>,
         mut words: mpsc::UnboundedReceiver<Word>,
         notices: mpsc::UnboundedSender<Notice>,
-    ) {
+    ) -> Result<(), ServoDead> {
         let (greeted_tx, mut greeted) = mpsc::channel::<Greeted>(MAX_GREETING);
         let mut drain = interval(DRAIN);
         drain.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut active: Option<Active> = None;
         let mut skill: Option<Arc<Skill>> = None;
         let mut epoch = 0;
+        let permits = Arc::new(Semaphore::new(MAX_GREETING));
         loop {
-            let ended = self.flush(active.as_mut()).await;
+            let ended = self.flush(active.as_mut());
             if let Some(why) = ended {
                 self.end(&mut active, &mut skill, (why.0, &why.1), &notices);
             }
@@ -116,12 +161,17 @@ impl Daemon {
             tokio::select! {
                 biased;
                 () = told(&mut quit) => break,
-                Some(word) = words.recv() => self.order(match word {
-                    Word::Stop => Order::Stop(Cause::LocalStop),
-                    Word::Reset => Order::Reset { operator: active.is_some() },
-                }),
+                Some(word) = words.recv() => match word {
+                    Word::Stop => self.servo.brake.stop_here(),
+                    Word::Reset => self.order(Order::Reset { operator: active.is_some(), stop: None }),
+                },
                 _ = drain.tick() => {
                     self.drain(active.as_mut(), &notices);
+                    if self.silent_drains > MAX_SILENT_DRAINS {
+                        self.end(&mut active, &mut skill, (FAULT, "the servo has stopped"), &notices);
+                        self.endpoint.close(VarInt::from_u32(FAULT), b"the servo has stopped");
+                        return Err(ServoDead);
+                    }
                 }
                 why = receive(active.as_mut(), &self.clock) => if let Some(why) = why {
                     self.end(&mut active, &mut skill, (why.0, &why.1), &notices);
@@ -132,35 +182,30 @@ impl Daemon {
                     }
                 }
                 incoming = self.endpoint.accept() => match incoming {
-                    Some(incoming) => {
-                        tokio::spawn(greet(incoming, greeted_tx.clone(), notices.clone()));
-                    }
+                    Some(incoming) => match permits.clone().try_acquire_owned() {
+                        Ok(permit) => {
+                            tokio::spawn(greet(incoming, permit, greeted_tx.clone(), notices.clone()));
+                        }
+                        Err(_) => incoming.refuse(),
+                    },
                     None => break,
                 },
                 Some(next) = greeted.recv() => {
-                    if let Some(why) = self.admit(next, &mut active, &skill, &mut epoch, &notices).await {
+                    if let Some(why) = self.admit(next, &mut active, &skill, &mut epoch, &notices) {
                         let _ = notices.send(Notice::Refused { why });
                     }
                 }
             }
         }
-        self.order(Order::Stop(Cause::LocalStop));
         // Nobody leaves before the arm is at rest; the operator hears of the stop at once.
         for _ in 0..MAX_STOP_DRAINS {
-            sleep_until(
-                self.clock
-                    .instant(self.clock.now().offset_by_secs(DRAIN.as_secs_f64())),
-            )
-            .await;
+            self.servo.brake.stop_here();
+            drain.tick().await;
             let at_rest = self.drain(active.as_mut(), &notices);
-            let _ = self.flush(active.as_mut()).await;
+            let _ = self.flush(active.as_mut());
             if at_rest {
                 break;
             }
-        }
-        if let Some(active) = &mut active {
-            let _ = active.send.finish();
-            let _ = tokio::time::timeout(Duration::from_millis(500), active.send.stopped()).await;
         }
         self.end(
             &mut active,
@@ -168,13 +213,16 @@ impl Daemon {
             (CLOSED, "the robot daemon stops"),
             &notices,
         );
+        // The last words are written by their own task; a peer that does not take them is not waited for.
+        let _ = tokio::time::timeout(LAST_WORDS, self.endpoint.wait_idle()).await;
         self.endpoint
-            .close(VarInt::from_u32(0), b"the robot daemon stops");
+            .close(VarInt::from_u32(CLOSED), b"the robot daemon stops");
         self.endpoint.wait_idle().await;
+        Ok(())
     }
 
     /// Gives authority, or says why not.
-    async fn admit(
+    fn admit(
         &mut self,
         greeted: Greeted,
         active: &mut Option<Active>,
@@ -206,12 +254,15 @@ impl Daemon {
         let peer = connection.remote_address();
         if let Some((code, text)) = refusal {
             let why = format!("{peer}: {text}");
-            // The peer may be gone already; there is nobody else to tell.
-            let _ = control.write(&Answer::Reject { code, text }.encode()).await;
-            let _ = control.send.finish();
             tokio::spawn(async move {
-                let _ = tokio::time::timeout(Duration::from_secs(2), control.send.stopped()).await;
-                connection.close(VarInt::from_u32(2), b"rejected");
+                // The peer may be gone already; there is nobody else to tell.
+                let _ = tokio::time::timeout(LAST_WORDS, async {
+                    let _ = control.write(&Answer::Reject { code, text }.encode()).await;
+                    let _ = control.send.finish();
+                    let _ = control.send.stopped().await;
+                })
+                .await;
+                connection.close(VarInt::from_u32(REJECTED), b"rejected");
             });
             return Some(why);
         }
@@ -221,10 +272,10 @@ impl Daemon {
             features: 0,
             epoch: *epoch,
         };
-        if let Err(e) = control.write(&ack.encode()).await {
-            return Some(format!("{peer}: {e}"));
-        }
         let (send, frames) = control.into_frames();
+        let (writer, queue) = mpsc::channel(MAX_UNREAD);
+        let _ = writer.try_send(ack.encode());
+        let written = tokio::spawn(write(send, queue));
         let session = Session::new(
             self.config,
             self.info.clone(),
@@ -235,7 +286,8 @@ impl Daemon {
         *active = Some(Active {
             session,
             connection,
-            send,
+            writer,
+            written,
             frames,
         });
         let _ = notices.send(Notice::Connected {
@@ -246,8 +298,10 @@ impl Daemon {
     }
 
     fn order(&mut self, order: Order) {
-        // 64 orders are more than a second's worth; a full ring means a dead servo, which holds no lease.
-        let _ = self.servo.orders.push(order);
+        // 64 orders are more than a second's worth. What does not fit is not forgotten but a reason to stop.
+        if self.servo.orders.push(order).is_err() {
+            self.servo.brake.pull(Cause::Fault);
+        }
     }
 
     /// Takes the servo's reports; says whether the newest is of an arm stopped and at rest.
@@ -257,6 +311,7 @@ impl Daemon {
         notices: &mpsc::UnboundedSender<Notice>,
     ) -> bool {
         let mut at_rest = false;
+        self.silent_drains += 1;
         let timing = self
             .timing
             .as_deref()
@@ -269,6 +324,7 @@ impl Daemon {
                 }
             });
         while let Ok(report) = self.servo.reports.pop() {
+            self.silent_drains = 0;
             self.info.state = report.state;
             at_rest = report.state == RobotState::Stopped && !report.moving;
             if let Some(active) = active.as_deref_mut() {
@@ -281,15 +337,23 @@ impl Daemon {
     }
 
     /// Does what the session wants; a reason if the session is over.
-    async fn flush(&mut self, active: Option<&mut Active>) -> Option<(u32, String)> {
+    fn flush(&mut self, active: Option<&mut Active>) -> Option<(u32, String)> {
         let active = active?;
         while let Some(output) = active.session.poll_output() {
             match output {
                 Output::Control(payload) => {
-                    if let Err(e) = write_frame(&mut active.send, &payload).await {
-                        return Some((CLOSED, e.to_string()));
+                    if active
+                        .writer
+                        .try_send(frame::encode(&payload, false))
+                        .is_err()
+                    {
+                        return Some((
+                            CLOSED,
+                            "the operator does not read what the robot says".into(),
+                        ));
                     }
                 }
+                Output::Brake(cause) => self.servo.brake.pull(cause),
                 // Too large or unsupported cannot happen (1100 B); a lost connection shows up in `receive`.
                 Output::Datagram(bytes) => drop(active.connection.send_datagram(bytes.into())),
                 Output::Order(order) => self.order(order),
@@ -315,25 +379,35 @@ impl Daemon {
                 self.order(order);
             }
         }
-        ended
-            .connection
-            .close(VarInt::from_u32(code), why.as_bytes());
-        if let Some(held) = ended.session.skill() {
+        let Active {
+            connection,
+            writer,
+            written,
+            ..
+        } = ended;
+        let ended = ended.session;
+        drop(writer);
+        let reason = why.as_bytes().to_vec();
+        tokio::spawn(async move {
+            let _ = tokio::time::timeout(LAST_WORDS, written).await;
+            connection.close(VarInt::from_u32(code), &reason);
+        });
+        if let Some(held) = ended.skill() {
             *skill = Some(held);
         }
-        if let Some(mirror) = ended.session.mirror() {
+        if let Some(mirror) = ended.mirror() {
             let knot = |k: &telemime_protocol::checkpoint::path::DecodedKnot| {
                 (k.t.as_secs_f64(), k.x.into(), k.v.into())
             };
             let _ = notices.send(Notice::Path(mirror.path().knots().map(knot).collect()));
         }
         let now = self.clock.now();
-        let clock = ended.session.clock();
+        let clock = ended.clock();
         let clock = clock
             .to_session(now)
             .zip(clock.uncertainty_s(now))
             .map(|(t, bound_s)| ((t.0 - now.0) as f64 * 1e-9, bound_s));
-        let counters = ended.session.counters();
+        let counters = ended.counters();
         let _ = notices.send(Notice::Disconnected {
             why: why.to_owned(),
             clock,
@@ -366,9 +440,21 @@ async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<(u32,
     }
 }
 
+/// Writes the control stream until the session drops it or the operator is gone.
+async fn write(mut send: SendStream, mut queue: mpsc::Receiver<Vec<u8>>) {
+    while let Some(bytes) = queue.recv().await {
+        if send.write_all(&bytes).await.is_err() {
+            return;
+        }
+    }
+    let _ = send.finish();
+    let _ = send.stopped().await;
+}
+
 /// Handshake and greeting, beside the running session.
 async fn greet(
     incoming: Incoming,
+    _permit: OwnedSemaphorePermit,
     greeted: mpsc::Sender<Greeted>,
     notices: mpsc::UnboundedSender<Notice>,
 ) {
@@ -408,7 +494,7 @@ async fn greet(
                     .encode(),
                 )
                 .await;
-            connection.close(VarInt::from_u32(3), b"malformed greeting");
+            connection.close(VarInt::from_u32(MALFORMED_GREETING), b"malformed greeting");
             refused(text);
         }
     }

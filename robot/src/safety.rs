@@ -4,6 +4,8 @@
 use telemime_endpoint::Mono;
 use telemime_protocol::wire::v1::{Cause, RobotState};
 
+use crate::servo::Lease;
+
 /// What the state machine is set to.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SafetyConfig {
@@ -79,26 +81,31 @@ impl Safety {
     }
 
     /// Engages, from `Ready` or `Holding` only; says whether.
-    pub fn engage(&mut self, now: Mono, lease_s: f64) -> bool {
-        if !matches!(self.state, RobotState::Ready | RobotState::Holding) {
+    pub fn engage(&mut self, now: Mono, lease: Lease) -> bool {
+        let may = matches!(self.state, RobotState::Ready | RobotState::Holding);
+        if !may || self.bounded(lease) <= now {
             return false;
         }
         self.enter(RobotState::Engaged, Cause::Requested);
-        self.news(now, lease_s);
+        self.news(lease);
         true
     }
 
-    /// News arrived and authorises motion for `lease_s` from `now` (or from when it should have arrived).
-    pub fn news(&mut self, now: Mono, lease_s: f64) {
+    /// News arrived and authorises motion until its lease ends, and no longer than the longest lease.
+    pub fn news(&mut self, lease: Lease) {
         if !self.is_following() {
             return;
         }
-        self.last_news = self.last_news.max(now);
-        let lease_s = lease_s.clamp(0.0, self.config.max_lease_s);
-        self.lease_until = self.lease_until.max(now.offset_by_secs(lease_s));
+        self.last_news = self.last_news.max(lease.from);
+        self.lease_until = self.lease_until.max(self.bounded(lease));
         if self.state == RobotState::Coasting {
             self.enter(RobotState::Engaged, Cause::NewsArrived);
         }
+    }
+
+    fn bounded(&self, lease: Lease) -> Mono {
+        let longest = lease.from.offset_by_secs(self.config.max_lease_s);
+        lease.until.min(longest)
     }
 
     /// The clutch is let go, or the motion is over.
@@ -116,15 +123,22 @@ impl Safety {
     }
 
     /// Emergency stop, from any state, latched.
+    /// A stop at the robot takes over from one of the operator's: it asks for more.
     pub fn stop(&mut self, cause: Cause) {
-        if self.state != RobotState::Stopped {
+        let takes_over = cause == Cause::LocalStop && self.cause != Cause::LocalStop;
+        if self.state != RobotState::Stopped || takes_over {
             self.enter(RobotState::Stopped, cause);
         }
     }
 
-    /// Leaves the latched stop, on purpose.
-    pub fn reset(&mut self, operator_present: bool) {
-        if self.state == RobotState::Stopped {
+    /// Leaves the latched stop, on purpose. `stop` names it by [`Safety::transitions`], so that a stop nobody
+    /// has seen is not left; a stop made at the robot is left at the robot only (`None`).
+    pub fn reset(&mut self, operator_present: bool, stop: Option<u32>) {
+        let meant = match stop {
+            None => true,
+            Some(stop) => stop == self.transitions && self.cause != Cause::LocalStop,
+        };
+        if self.state == RobotState::Stopped && meant {
             let next = if operator_present {
                 RobotState::Ready
             } else {
@@ -134,7 +148,7 @@ impl Safety {
         }
     }
 
-    /// Checks the deadlines; to be called first in every tick.
+    /// Checks the deadlines; to be called first and last in every tick.
     pub fn tick(&mut self, now: Mono) {
         if !self.is_following() {
             return;
@@ -179,10 +193,18 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
+    fn lease(from_ms: i64, lease_s: f64) -> Lease {
+        let from = Mono(from_ms * MS);
+        Lease {
+            from,
+            until: from.offset_by_secs(lease_s),
+        }
+    }
+
     fn engaged() -> Safety {
         let mut safety = Safety::new(SafetyConfig::default());
         safety.set_operator(true);
-        assert!(safety.engage(Mono(0), 0.45));
+        assert!(safety.engage(Mono(0), lease(0, 0.45)));
         safety
     }
 
@@ -202,14 +224,14 @@ mod tests {
             (safety.state(), safety.cause()),
             (RobotState::Holding, Cause::LeaseExpired)
         );
-        safety.news(Mono(451 * MS), 0.45);
+        safety.news(lease(451, 0.45));
         safety.tick(Mono(451 * MS));
         assert_eq!(
             safety.state(),
             RobotState::Holding,
             "never re-engages by itself"
         );
-        assert!(safety.engage(Mono(500 * MS), 0.45));
+        assert!(safety.engage(Mono(500 * MS), lease(500, 0.45)));
     }
 
     #[test]
@@ -217,7 +239,7 @@ mod tests {
         let mut safety = engaged();
         safety.tick(Mono(300 * MS));
         assert_eq!(safety.state(), RobotState::Coasting);
-        safety.news(Mono(301 * MS), 0.45);
+        safety.news(lease(301, 0.45));
         assert_eq!(
             (safety.state(), safety.speed_scale(Mono(302 * MS))),
             (RobotState::Engaged, 1.0)
@@ -227,15 +249,21 @@ mod tests {
     #[test]
     fn the_stop_is_latched_and_every_lease_is_bounded() {
         let mut safety = engaged();
-        safety.news(Mono(0), 1e9);
+        safety.news(lease(0, 1e9));
         safety.tick(Mono(1001 * MS));
         assert_eq!(safety.state(), RobotState::Holding);
         safety.stop(Cause::LocalStop);
-        assert!(!safety.engage(Mono(0), 0.45));
+        assert!(!safety.engage(Mono(0), lease(0, 0.45)));
         safety.set_operator(false);
         safety.set_operator(true);
         assert_eq!(safety.state(), RobotState::Stopped);
-        safety.reset(true);
+        safety.reset(true, Some(safety.transitions()));
+        assert_eq!(
+            safety.state(),
+            RobotState::Stopped,
+            "a local stop is left at the robot"
+        );
+        safety.reset(true, None);
         assert_eq!(safety.state(), RobotState::Ready);
     }
 

@@ -160,14 +160,14 @@ impl Pair {
             socket,
             &Meter::default(),
         )?;
-        let daemon = RobotDaemon {
+        let daemon = RobotDaemon::new(
             endpoint,
             clock,
-            info: rig.info(),
-            config: Default::default(),
-            servo: handle,
-            timing: None,
-        };
+            rig.info(),
+            Default::default(),
+            handle,
+            None,
+        );
         let (quit, quit_rx) = watch::channel(false);
         let (tx, mut rx) = mpsc::unbounded_channel();
         let (words, words_rx) = mpsc::unbounded_channel();

@@ -156,6 +156,7 @@ pub struct Session {
     info: Option<Info>,
     model_stored: bool,
     state: RobotState,
+    changes: u32,
     hand: Option<HandState>,
     activity: Activity,
     engagement: u32,
@@ -189,6 +190,7 @@ impl Session {
             info: None,
             model_stored: false,
             state: RobotState::Idle,
+            changes: 0,
             hand: None,
             activity: Activity::Nothing,
             engagement: 0,
@@ -269,7 +271,7 @@ impl Session {
                     && *plan == id
                 {
                     *engaged = true;
-                    self.request(Drive::Play { plan: id });
+                    self.request(now, Drive::Play { plan: id });
                     self.last_sent = now;
                 }
             }
@@ -294,7 +296,14 @@ impl Session {
                 }
                 self.events.push_back(Event::Refused(reason));
             }
-            RobotControl::State { state, cause } => self.on_state(state, cause),
+            RobotControl::State {
+                state,
+                cause,
+                changes,
+            } => {
+                self.changes = changes;
+                self.on_state(state, cause);
+            }
         }
         Ok(())
     }
@@ -381,7 +390,7 @@ impl Session {
             return;
         };
         self.activity = Activity::Mirror(Box::new(mirror));
-        self.request(Drive::Mirror {
+        self.request(now, Drive::Mirror {
             state,
             model,
             params,
@@ -422,7 +431,8 @@ impl Session {
     /// Leaves the latched stop.
     pub fn reset(&mut self) {
         self.next_stop = None;
-        self.control(&OperatorControl::Reset);
+        let changes = self.changes;
+        self.control(&OperatorControl::Reset { changes });
     }
 
     /// Ends the session.
@@ -537,11 +547,12 @@ impl Session {
         self.events.push_back(Event::State(state, cause));
     }
 
-    fn request(&mut self, drive: Drive) {
+    fn request(&mut self, now: Stamp, drive: Drive) {
         self.engagement += 1;
         let rotation = self.config.rotation.as_ref();
         let engage = Engage {
             engagement: self.engagement,
+            t_us: now.0 / 1000,
             drive,
             scale: self.scale().unwrap_or(0.1) as f32,
             rotation: [

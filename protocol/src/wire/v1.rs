@@ -22,6 +22,9 @@ pub const MAX_DATAGRAM_LEN: usize = 1100;
 /// Most path knots in one [`Motion`].
 pub const MAX_KNOTS: usize = 32;
 
+/// Most path knots in one [`PathTail`].
+pub const MAX_TAIL_KNOTS: usize = 1024;
+
 /// Most joints in a [`Telemetry`].
 pub const MAX_JOINTS: usize = 10;
 
@@ -58,6 +61,8 @@ pub enum OperatorControl {
     },
     /// Asks for motion. The robot takes its reference at the instant it engages.
     Engage(Engage),
+    /// Path knots by the stream: what datagrams have not delivered, before a release or a backlog.
+    Path(PathTail),
     /// The clutch is let go: stop and hold.
     Release {
         /// Which engagement ends.
@@ -66,7 +71,10 @@ pub enum OperatorControl {
     /// Emergency stop, latched until [`OperatorControl::Reset`].
     EmergencyStop,
     /// Leaves the latched stop, on purpose.
-    Reset,
+    Reset {
+        /// `changes` of the [`RobotControl::State`] that told of the stop: a stop nobody has seen is not left.
+        changes: u32,
+    },
     /// The operator ends the session.
     Goodbye,
 }
@@ -76,6 +84,8 @@ pub enum OperatorControl {
 pub struct Engage {
     /// Counts up within the session; motions of another engagement are dropped.
     pub engagement: u32,
+    /// When this was asked, µs: an old request is no longer meant.
+    pub t_us: i64,
     /// What drives.
     pub drive: Drive,
     /// Tip metres per hand metre, in (0, 10].
@@ -144,6 +154,8 @@ pub enum RobotControl {
         state: RobotState,
         /// Why.
         cause: Cause,
+        /// Counts the changes since the robot daemon began.
+        changes: u32,
     },
 }
 
@@ -206,6 +218,8 @@ pub enum Cause {
     LocalStop,
     /// The robot's estimate of the session clock stepped.
     ClockStep,
+    /// The robot fell behind its own work.
+    Fault,
 }
 
 /// Why a request is declined.
@@ -217,7 +231,7 @@ pub enum Refusal {
     AlreadyEngaged,
     /// The engagement number is not above the last one.
     OldEngagement,
-    /// The hand state is too old to take a reference from.
+    /// The request, or the hand state to take a reference from, is too old.
     StaleReference,
     /// The session clock is not known yet.
     ClockUnknown,
@@ -231,6 +245,8 @@ pub enum Refusal {
     Moving,
     /// The two ends compute different predictions; the robot goes on with constant velocity.
     Diverged,
+    /// The stop was made at the robot, or is not the one the reset means: only those who see it may leave it.
+    NotYours,
 }
 
 /// Operator → robot, datagrams.
@@ -325,6 +341,19 @@ impl WireParams {
             cv_damping: value(self.cv_damping),
         }
     }
+}
+
+/// Knots of the path that ride on the control stream.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PathTail {
+    /// The engagement whose path this is.
+    pub engagement: u32,
+    /// What the first of `knots` is relative to.
+    pub state: WireState,
+    /// Number of the first of `knots` in the engagement's path.
+    pub first_knot: u32,
+    /// Knots in order, at most [`MAX_TAIL_KNOTS`].
+    pub knots: Vec<WireKnot>,
 }
 
 /// A knot of the path, relative to the one before it in the message; [`super::knots`] converts.
@@ -466,7 +495,17 @@ impl OperatorControl {
                     Drive::Play { .. } => Ok(()),
                 }
             }
-            Self::Release { .. } | Self::EmergencyStop | Self::Reset | Self::Goodbye => Ok(()),
+            Self::Path(tail) => {
+                require(
+                    tail.knots.len() <= MAX_TAIL_KNOTS,
+                    "path.knots",
+                    "more than 1024",
+                )?;
+                tail.state.check()
+            }
+            Self::Release { .. } | Self::EmergencyStop | Self::Reset { .. } | Self::Goodbye => {
+                Ok(())
+            }
         }
     }
 }

@@ -7,6 +7,7 @@ use telemime_protocol::spline::BSpline;
 use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_sim::arm::{Joints, Plant, PlantReport};
 
+use super::brake::Brake;
 use super::mapping::Mapping;
 use crate::control::{Clamps, Controller, Demand};
 use crate::safety::{Safety, SafetyConfig};
@@ -16,6 +17,9 @@ pub const RAMP_S: f64 = 0.5;
 
 /// Below this tip speed the arm counts as still, m/s.
 const STILL_M_S: f64 = 1e-3;
+
+/// Above this joint speed it does not, wherever its reference is, rad/s or m/s.
+const STILL_RAD_S: f64 = 0.01;
 
 /// After a plan's end the arm gets this long to arrive, s.
 const SETTLE_S: f64 = 0.3;
@@ -53,22 +57,41 @@ pub enum Source {
     Play(Box<Trajectory>),
 }
 
+/// Which engagement of which session.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Ticket {
+    /// The session's epoch, unique for the life of the daemon; 0 is none.
+    pub epoch: u32,
+    /// The engagement's number within the session.
+    pub number: u32,
+}
+
+/// How long a message authorises motion, on the robot's clock and fixed when it arrived: what waits in a
+/// queue does not last longer for it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Lease {
+    /// When it arrived.
+    pub from: Mono,
+    /// When it ends.
+    pub until: Mono,
+}
+
 /// A granted request to engage.
 #[derive(Debug)]
 pub struct Engagement {
-    /// Its number.
-    pub number: u32,
+    /// Whose it is.
+    pub ticket: Ticket,
     /// What drives.
     pub source: Source,
     /// Tip metres per hand metre.
     pub scale: f64,
     /// Hand axes to base axes.
     pub rotation: UnitQuaternion<f64>,
-    /// First lease, s.
-    pub lease_s: f64,
+    /// First lease.
+    pub lease: Lease,
 }
 
-/// What the session tells the servo.
+/// What the session tells the servo. Stops are not among it: a [`Brake`] needs no queue.
 #[derive(Debug)]
 pub enum Order {
     /// An operator has, or loses, authority.
@@ -77,28 +100,30 @@ pub enum Order {
     Engage(Engagement),
     /// Newest prediction, and the lease that came with it.
     Track {
+        /// For which engagement.
+        ticket: Ticket,
         /// The prediction.
         forecast: Forecast,
         /// When its newest sample was valid.
         valid_at: Mono,
-        /// Lease from now, s.
-        lease_s: f64,
+        /// For how long.
+        lease: Lease,
     },
     /// Play goes on.
     Extend {
-        /// Lease from now, s.
-        lease_s: f64,
+        /// For which engagement.
+        ticket: Ticket,
+        /// For how long.
+        lease: Lease,
     },
     /// The clutch is let go.
-    Release,
-    /// Stop and hold until a fresh engage.
-    Hold(Cause),
-    /// Emergency stop.
-    Stop(Cause),
+    Release(Ticket),
     /// Leave the latched stop.
     Reset {
         /// Whether an operator has authority.
         operator: bool,
+        /// The stop that is meant, by [`Report::transitions`]; `None` is whoever stands at the arm.
+        stop: Option<u32>,
     },
 }
 
@@ -115,12 +140,12 @@ pub struct Report {
     pub cause: Cause,
     /// Counts state changes.
     pub transitions: u32,
-    /// The engagement followed last, 0 before the first.
-    pub engagement: u32,
+    /// The engagement followed last; that of epoch 0 before the first.
+    pub engagement: Ticket,
     /// When it began.
     pub engaged_at: Mono,
-    /// The engagement declined last, and when: the arm had begun to move, or a stop came first.
-    pub declined: (u32, Mono),
+    /// The engagement declined last: the arm had begun to move, or a stop came first.
+    pub declined: Ticket,
     /// Its mapping.
     pub mapping: Mapping,
     /// The arm still moves.
@@ -161,6 +186,8 @@ pub struct Rings {
     pub reports: rtrb::Producer<Report>,
     /// Trajectories no longer needed, to be freed elsewhere.
     pub spent: rtrb::Producer<Box<Trajectory>>,
+    /// Stops.
+    pub brake: Brake,
 }
 
 /// The session's ends of the rings.
@@ -172,6 +199,8 @@ pub struct Handle {
     pub reports: rtrb::Consumer<Report>,
     /// Trajectories to free.
     pub spent: rtrb::Consumer<Box<Trajectory>>,
+    /// Stops.
+    pub brake: Brake,
 }
 
 /// A pair of ring ends: 64 orders, 4096 reports (four seconds).
@@ -179,18 +208,20 @@ pub fn rings() -> (Rings, Handle) {
     let (order_in, orders) = rtrb::RingBuffer::new(64);
     let (reports, report_out) = rtrb::RingBuffer::new(4096);
     let (spent, spent_out) = rtrb::RingBuffer::new(64);
-    (
-        Rings {
-            orders,
-            reports,
-            spent,
-        },
-        Handle {
-            orders: order_in,
-            reports: report_out,
-            spent: spent_out,
-        },
-    )
+    let brake = Brake::default();
+    let servo = Rings {
+        orders,
+        reports,
+        spent,
+        brake: brake.clone(),
+    };
+    let session = Handle {
+        orders: order_in,
+        reports: report_out,
+        spent: spent_out,
+        brake,
+    };
+    (servo, session)
 }
 
 #[expect(
@@ -212,9 +243,9 @@ pub struct Core {
     rings: Rings,
     drive: Drive,
     mapping: Mapping,
-    engagement: u32,
+    engagement: Ticket,
     engaged_at: Mono,
-    declined: (u32, Mono),
+    declined: Ticket,
     clamps: u32,
     out_of_reach: bool,
     tick: u64,
@@ -242,9 +273,9 @@ impl Core {
             rings,
             drive: Drive::Nothing,
             mapping,
-            engagement: 0,
+            engagement: Ticket::default(),
             engaged_at: Mono(0),
-            declined: (0, Mono(i64::MIN)),
+            declined: Ticket::default(),
             clamps: 0,
             out_of_reach: false,
             tick: 0,
@@ -262,8 +293,17 @@ impl Core {
 
     /// One period of work, at `now` on the robot's clock.
     pub fn tick(&mut self, now: Mono) -> Report {
+        // A lease that ran out while orders waited is over before they are read.
+        self.safety.tick(now);
         while let Ok(order) = self.rings.orders.pop() {
             self.obey(order, now);
+        }
+        let pulled = self.rings.brake.take();
+        if let Some(cause) = pulled.hold() {
+            self.safety.hold(cause);
+        }
+        if let Some(cause) = pulled.stop() {
+            self.safety.stop(cause);
         }
         self.safety.tick(now);
         let demand = self.demand(now);
@@ -277,7 +317,7 @@ impl Core {
         }
         self.tip_m = output.tip;
         self.reference_m = output.reference.p;
-        self.moving = output.reference.v.norm() > STILL_M_S;
+        self.moving = output.reference.v.norm() > STILL_M_S || self.plant.qd().amax() > STILL_RAD_S;
         self.tick += 1;
         let report = self.report(now);
         // A full ring means a stalled session; the servo does not wait for it.
@@ -290,25 +330,33 @@ impl Core {
             Order::Operator(present) => self.safety.set_operator(present),
             Order::Engage(engagement) => self.engage(engagement, now),
             Order::Track {
+                ticket,
                 forecast,
                 valid_at,
-                lease_s,
+                lease,
             } => {
                 if let Drive::Mirror {
                     forecast: held,
                     valid_at: held_at,
                 } = &mut self.drive
+                    && ticket == self.engagement
                 {
                     *held = forecast;
                     *held_at = valid_at;
-                    self.safety.news(now, lease_s);
+                    self.safety.news(lease);
                 }
             }
-            Order::Extend { lease_s } => self.safety.news(now, lease_s),
-            Order::Release => self.safety.release(Cause::Requested),
-            Order::Hold(cause) => self.safety.hold(cause),
-            Order::Stop(cause) => self.safety.stop(cause),
-            Order::Reset { operator } => self.safety.reset(operator),
+            Order::Extend { ticket, lease } => {
+                if matches!(self.drive, Drive::Play(_)) && ticket == self.engagement {
+                    self.safety.news(lease);
+                }
+            }
+            Order::Release(ticket) => {
+                if ticket == self.engagement {
+                    self.safety.release(Cause::Requested);
+                }
+            }
+            Order::Reset { operator, stop } => self.safety.reset(operator, stop),
         }
     }
 
@@ -317,8 +365,8 @@ impl Core {
             Source::Mirror { forecast, valid_at } => Drive::Mirror { forecast, valid_at },
             Source::Play(trajectory) => Drive::Play(trajectory),
         };
-        if self.moving || !self.safety.engage(now, engagement.lease_s) {
-            self.declined = (engagement.number, now);
+        if self.moving || !self.safety.engage(now, engagement.lease) {
+            self.declined = engagement.ticket;
             self.discard(drive);
             return;
         }
@@ -339,7 +387,7 @@ impl Core {
             hand_m,
             tip_m,
         };
-        self.engagement = engagement.number;
+        self.engagement = engagement.ticket;
         self.engaged_at = now;
         self.clamps = 0;
     }

@@ -3,14 +3,16 @@
 //! [`Core`] is sans-IO: time comes in as an argument, commands and reports go through wait-free rings.
 //! A tick never allocates, locks, logs or waits.
 
+mod brake;
 mod core;
 mod mapping;
 mod stats;
 pub mod thread;
 
 pub use self::core::{
-    Core, CoreConfig, Engagement, Handle, Order, RAMP_S, Report, Rings, Source, Trajectory, ramp,
-    rings,
+    Core, CoreConfig, Engagement, Handle, Lease, Order, RAMP_S, Report, Rings, Source, Ticket,
+    Trajectory, ramp, rings,
 };
+pub use brake::Brake;
 pub use mapping::Mapping;
 pub use stats::TickStats;

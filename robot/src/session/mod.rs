@@ -24,7 +24,7 @@ use telemime_protocol::wire::v1::{
 };
 
 use crate::clock::{SessionClock, Slew};
-use crate::servo::{Engagement, Order, Report, Source, Trajectory};
+use crate::servo::{Engagement, Lease, Order, Report, Source, Ticket, Trajectory};
 use motion::Mirror;
 
 /// Pings in quick succession at the start, so that the clock is known before the first engage.
@@ -63,6 +63,8 @@ pub enum Output {
     Datagram(Vec<u8>),
     /// An order for the servo.
     Order(Order),
+    /// A stop or hold, past every queue.
+    Brake(Cause),
     /// The operator said goodbye.
     Goodbye,
 }
@@ -98,7 +100,6 @@ pub struct Session {
     plan: Option<(u32, Plan<3>)>,
     mirror: Option<Mirror>,
     engagement: u32,
-    requested_at: Mono,
     acknowledged: u32,
     newest_seq: u32,
     delay_s: f64,
@@ -131,7 +132,6 @@ impl Session {
             plan: None,
             mirror: None,
             engagement: 0,
-            requested_at: now,
             acknowledged: 0,
             newest_seq: 0,
             delay_s: 0.0,
@@ -199,20 +199,18 @@ impl Session {
             }
             OperatorControl::Release { engagement } => {
                 if engagement == self.engagement {
-                    self.order(Order::Release);
+                    self.order(Order::Release(self.ticket()));
                 }
             }
+            OperatorControl::Path(tail) => self.on_path(&tail),
             OperatorControl::EmergencyStop => {
-                self.order(Order::Stop(Cause::OperatorStop));
+                self.brake(Cause::OperatorStop);
                 // A stop on top of a stop changes no state: without this the operator would wait for news.
                 if let Some(report) = self.report.filter(|r| r.state == RobotState::Stopped) {
-                    self.send(&RobotControl::State {
-                        state: report.state,
-                        cause: report.cause,
-                    });
+                    self.send_state(&report);
                 }
             }
-            OperatorControl::Reset => self.order(Order::Reset { operator: true }),
+            OperatorControl::Reset { changes } => self.reset(changes),
             OperatorControl::Goodbye => self.outputs.push_back(Output::Goodbye),
         }
         Ok(())
@@ -246,7 +244,7 @@ impl Session {
                 true
             }
             Ok(OperatorDatagram::Stop { epoch }) if epoch == self.epoch => {
-                self.order(Order::Stop(Cause::OperatorStop));
+                self.brake(Cause::OperatorStop);
                 true
             }
             Ok(OperatorDatagram::Pong { .. } | OperatorDatagram::Stop { .. }) | Err(_) => false,
@@ -262,39 +260,29 @@ impl Session {
         let changed = self.transitions != Some(report.transitions);
         self.transitions = Some(report.transitions);
         self.report = Some(*report);
-        // Numbers start afresh with every session: what was engaged before the request is another's.
-        if self.engagement != 0
-            && report.engagement == self.engagement
-            && report.engaged_at >= self.requested_at
-            && self.acknowledged != self.engagement
-        {
+        let pending = self.acknowledged != self.engagement;
+        if pending && report.engagement == self.ticket() {
             self.acknowledged = self.engagement;
             let t_us = self
                 .clock
                 .to_session(report.engaged_at)
                 .map_or(0, |t| t.0 / 1000);
             self.send(&RobotControl::Engaged {
-                engagement: report.engagement,
+                engagement: self.engagement,
                 t_us,
                 hand_m: report.mapping.hand_m.cast::<f32>().into(),
                 tip_m: report.mapping.tip_m.cast::<f32>().into(),
             });
-        }
-        if self.acknowledged != self.engagement
-            && report.declined.0 == self.engagement
-            && report.declined.1 >= self.requested_at
-        {
+        } else if pending && report.declined == self.ticket() {
             self.acknowledged = self.engagement;
+            self.mirror = None;
             self.refuse(match report.state {
                 RobotState::Stopped => Refusal::Stopped,
                 _ => Refusal::Moving,
             });
         }
         if changed {
-            self.send(&RobotControl::State {
-                state: report.state,
-                cause: report.cause,
-            });
+            self.send_state(report);
         }
     }
 
@@ -357,6 +345,8 @@ impl Session {
         match report.state {
             RobotState::Stopped => return Err(Refusal::Stopped),
             RobotState::Engaged | RobotState::Coasting => return Err(Refusal::AlreadyEngaged),
+            // What was granted a moment ago is not in a report yet.
+            _ if self.acknowledged != self.engagement => return Err(Refusal::AlreadyEngaged),
             RobotState::Idle | RobotState::Ready | RobotState::Holding => {}
         }
         if report.moving {
@@ -369,6 +359,13 @@ impl Session {
         let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
         // From here on an estimate may be applied at once: nothing is being followed.
         self.clock.slew(now, false);
+        let asked = Stamp(engage.t_us.saturating_mul(1000));
+        let asked_at = self.clock.to_mono(asked).ok_or(Refusal::ClockUnknown)?;
+        let age_s = now.secs_since(asked_at);
+        if age_s.abs() > self.config.max_delay_s {
+            return Err(Refusal::StaleReference);
+        }
+        let late_s = age_s.max(0.0);
         let (source, mirror) = match &engage.drive {
             Drive::Mirror {
                 state,
@@ -403,14 +400,16 @@ impl Session {
             }
         };
         self.engagement = engage.engagement;
-        self.requested_at = now;
         self.mirror = mirror;
         self.order(Order::Engage(Engagement {
-            number: engage.engagement,
+            ticket: self.ticket(),
             source,
             scale: f64::from(engage.scale),
             rotation,
-            lease_s: f64::from(engage.lease_ms) * 1e-3,
+            lease: Lease {
+                from: now,
+                until: now.offset_by_secs(f64::from(engage.lease_ms) * 1e-3 - late_s),
+            },
         }));
         Ok(())
     }
@@ -420,7 +419,7 @@ impl Session {
             .report
             .is_some_and(|r| matches!(r.state, RobotState::Engaged | RobotState::Coasting));
         if self.clock.slew(now, following) == Slew::Step {
-            self.order(Order::Hold(Cause::ClockStep));
+            self.brake(Cause::ClockStep);
         }
     }
 
@@ -436,7 +435,11 @@ impl Session {
             epoch: self.epoch,
             seq: self.telemetry_seq,
             state: report.state,
-            engagement: report.engagement,
+            engagement: if report.engagement.epoch == self.epoch {
+                report.engagement.number
+            } else {
+                0
+            },
             t_us: self.clock.to_session(report.at).map_or(0, |t| t.0 / 1000),
             clock_uncertainty_us: uncertainty_us as u32,
             age_ms: milliseconds(report.age_s),
@@ -459,6 +462,35 @@ impl Session {
         })
     }
 
+    /// Only those who know of a stop may leave it, and one made at the robot is left at the robot.
+    fn reset(&mut self, changes: u32) {
+        let Some(report) = self.report.filter(|r| r.state == RobotState::Stopped) else {
+            return;
+        };
+        if report.cause == Cause::LocalStop || report.transitions != changes {
+            return self.refuse(Refusal::NotYours);
+        }
+        self.order(Order::Reset {
+            operator: true,
+            stop: Some(changes),
+        });
+    }
+
+    fn ticket(&self) -> Ticket {
+        Ticket {
+            epoch: self.epoch,
+            number: self.engagement,
+        }
+    }
+
+    fn send_state(&mut self, report: &Report) {
+        self.send(&RobotControl::State {
+            state: report.state,
+            cause: report.cause,
+            changes: report.transitions,
+        });
+    }
+
     fn refuse(&mut self, reason: Refusal) {
         self.send(&RobotControl::Refused { reason });
     }
@@ -469,5 +501,9 @@ impl Session {
 
     fn order(&mut self, order: Order) {
         self.outputs.push_back(Output::Order(order));
+    }
+
+    fn brake(&mut self, cause: Cause) {
+        self.outputs.push_back(Output::Brake(cause));
     }
 }

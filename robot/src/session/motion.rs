@@ -5,10 +5,11 @@ use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid};
 use telemime_protocol::predict::{Forecast, HandState, Params};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::knots;
-use telemime_protocol::wire::v1::{Motion, Refusal, model_tag};
+use telemime_protocol::wire::state::WireState;
+use telemime_protocol::wire::v1::{Motion, PathTail, Refusal, WireKnot, model_tag};
 
 use super::Session;
-use crate::servo::Order;
+use crate::servo::{Lease, Order};
 
 /// Knots of the path kept: minutes of motion, a fixed amount of memory.
 const PATH_KNOTS: usize = 8192;
@@ -40,7 +41,7 @@ impl Session {
         if age_s < -self.config.max_delay_s {
             return false;
         }
-        mirror.take_knots(motion);
+        mirror.take_knots(&motion.state, motion.first_knot, &motion.knots);
         let fresh = motion.seq > self.newest_seq;
         if fresh {
             self.newest_seq = motion.seq;
@@ -51,9 +52,8 @@ impl Session {
             return fresh;
         }
         mirror.newest_t = state.t;
-        let lease_s =
-            f64::from(motion.lease_ms) * 1e-3 - (age_s - self.config.max_delay_s).max(0.0);
-        if lease_s <= 0.0 {
+        let lease = Self::lease(self.config.max_delay_s, now, motion.lease_ms, age_s);
+        if lease.until <= now {
             return false;
         }
         self.delay_s = age_s;
@@ -73,7 +73,8 @@ impl Session {
         self.order(Order::Track {
             forecast,
             valid_at,
-            lease_s,
+            ticket: self.ticket(),
+            lease,
         });
         true
     }
@@ -101,15 +102,34 @@ impl Session {
         if age_s < -self.config.max_delay_s {
             return false;
         }
-        let lease_s = f64::from(lease_ms) * 1e-3 - (age_s - self.config.max_delay_s).max(0.0);
-        if lease_s <= 0.0 {
+        let lease = Self::lease(self.config.max_delay_s, now, lease_ms, age_s);
+        if lease.until <= now {
             return false;
         }
         self.newest_seq = seq;
         self.counters.received += 1;
         self.delay_s = age_s;
-        self.order(Order::Extend { lease_s });
+        let ticket = self.ticket();
+        self.order(Order::Extend { ticket, lease });
         true
+    }
+
+    /// Counted from the arrival, or from when the message should have arrived at the latest.
+    fn lease(max_delay_s: f64, now: Mono, lease_ms: u16, age_s: f64) -> Lease {
+        let too_late_s = (age_s - max_delay_s).max(0.0);
+        Lease {
+            from: now,
+            until: now.offset_by_secs(f64::from(lease_ms) * 1e-3 - too_late_s),
+        }
+    }
+
+    /// Path knots by the stream.
+    pub(super) fn on_path(&mut self, tail: &PathTail) {
+        if tail.engagement == self.engagement
+            && let Some(mirror) = &mut self.mirror
+        {
+            mirror.take_knots(&tail.state, tail.first_knot, &tail.knots);
+        }
     }
 
     /// The prediction from `state`: by the model named, or by constant velocity until it has arrived.
@@ -153,12 +173,12 @@ impl Mirror {
         &self.path
     }
 
-    fn take_knots(&mut self, motion: &Motion) {
+    fn take_knots(&mut self, state: &WireState, first_knot: u32, packed: &[WireKnot]) {
         // A message that begins beyond the frontier leaves a gap: its knots come again.
-        let Some(known) = self.frontier.checked_sub(motion.first_knot) else {
+        let Some(known) = self.frontier.checked_sub(first_knot) else {
             return;
         };
-        for knot in knots::unpack(&motion.state, self.grid, &motion.knots).skip(known as usize) {
+        for knot in knots::unpack(state, self.grid, packed).skip(known as usize) {
             if self.path.append(&knot).is_err() {
                 return;
             }
