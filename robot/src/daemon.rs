@@ -191,13 +191,7 @@ impl Daemon {
         let peer = connection.remote_address();
         if let Some((code, text)) = refusal {
             let why = format!("{peer}: {text}");
-            // The peer may be gone already; there is nobody else to tell.
-            let _ = control.write(&Answer::Reject { code, text }.encode()).await;
-            let _ = control.send.finish();
-            tokio::spawn(async move {
-                let _ = tokio::time::timeout(Duration::from_secs(2), control.send.stopped()).await;
-                connection.close(VarInt::from_u32(2), b"rejected");
-            });
+            tokio::spawn(turn_away(connection, control, code, text));
             return Some(why);
         }
         *epoch += 1;
@@ -374,17 +368,17 @@ async fn greet(
         }
         Err(e) => {
             let text = e.to_string();
-            let _ = control
-                .write(
-                    &Answer::Reject {
-                        code: RejectCode::Malformed,
-                        text: text.clone(),
-                    }
-                    .encode(),
-                )
-                .await;
-            connection.close(VarInt::from_u32(3), b"malformed greeting");
+            turn_away(connection, control, RejectCode::Malformed, text.clone()).await;
             refused(text);
         }
     }
+}
+
+/// Says why there is no session, and closes once that has been read.
+async fn turn_away(connection: Connection, mut control: Control, code: RejectCode, text: String) {
+    // The peer may be gone already; there is nobody else to tell.
+    let _ = control.write(&Answer::Reject { code, text }.encode()).await;
+    let _ = control.send.finish();
+    let _ = tokio::time::timeout(Duration::from_secs(2), control.send.stopped()).await;
+    connection.close(VarInt::from_u32(2), b"rejected");
 }

@@ -4,6 +4,8 @@ mod arms;
 mod codec;
 mod mirror;
 mod paper;
+mod play;
 mod prediction;
 mod safety;
 mod scene;
+mod strangers;
