@@ -6,6 +6,7 @@ use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::Arc;
 
+use telemime_endpoint::cli::told;
 use telemime_endpoint::meter::IP_UDP_HEADER;
 use telemime_endpoint::{HostClock, Mono};
 use telemime_sim::link::{Fate, Link, LinkConfig};
@@ -113,7 +114,7 @@ impl Relay {
                 .map(|Reverse((at, _))| self.clock.instant(Mono(*at)));
             let packet = tokio::select! {
                 biased;
-                _ = quit.wait_for(|quit| *quit) => break,
+                () = told(&mut quit) => break,
                 () = sleep_until(next.unwrap_or_else(tokio::time::Instant::now)), if next.is_some() => {
                     let now = self.clock.now();
                     while let Some(&Reverse((at, id))) = due.peek() && at <= now.0 {

@@ -18,7 +18,7 @@ use tokio::sync::mpsc;
 use crate::daemon::Daemon;
 use crate::session::{FutureBound, SessionConfig};
 use crate::task::{Outcome, Recording, Task};
-pub use report::{Event, PlayReport};
+pub use report::{Event, PlayReport, Scores};
 pub use skills::{Skills, infer};
 
 /// Teach, drive and play a robot.
@@ -49,6 +49,9 @@ pub struct Args {
     /// Load a skill that `telemime learn` saved; may be repeated.
     #[arg(long, value_name = "FILE")]
     pub skill: Vec<PathBuf>,
+    /// Save what --learn learned into this folder, one NAME.skill each.
+    #[arg(long, value_name = "DIR")]
+    pub save: Option<PathBuf>,
     /// Replay this recording (CSV: t,x,y,z) in real time, mirrored by the robot.
     #[arg(long, value_name = "FILE", conflicts_with = "play")]
     pub replay: Option<PathBuf>,
@@ -399,6 +402,21 @@ mod tests {
             error.contains("conect") && error.contains("operator.toml"),
             "{error}"
         );
+    }
+
+    #[test]
+    fn the_documented_configuration_is_understood_and_complete() {
+        let text = include_str!("../../docs/commands.md");
+        let example = text
+            .split("```toml operator\n")
+            .nth(1)
+            .and_then(|rest| rest.split("```").next())
+            .unwrap()
+            .replace("# play", "play")
+            .replace("# bound_m", "bound_m");
+        let file: File = toml::from_str(&example).unwrap();
+        assert!(!format!("{file:?}").contains("None"), "a key is missing");
+        parse_future_bound(&file.future_bound.unwrap()).unwrap();
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use quinn::{Connection, Endpoint, SendStream, VarInt};
-use telemime_endpoint::cli::Word;
+use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{Control, ControlError, write_frame};
 use telemime_endpoint::meter::Counts;
 use telemime_endpoint::{HostClock, Meter, Mono, quic};
@@ -127,6 +127,12 @@ struct Link {
     epoch: u32,
 }
 
+/// What the person at the terminal says.
+struct Console<'a> {
+    quit: &'a mut watch::Receiver<bool>,
+    words: &'a mut mpsc::UnboundedReceiver<Word>,
+}
+
 enum DialError {
     Again(String),
     Rejected { code: RejectCode, text: String },
@@ -161,23 +167,19 @@ impl Daemon {
         loop {
             let link = tokio::select! {
                 biased;
-                _ = quit.wait_for(|quit| *quit) => break,
+                () = told(&mut quit) => break,
                 link = self.dial(summary.sessions == 0, task, notices) => link?,
             };
             let Some(link) = link else { break };
             summary.sessions += 1;
             let _ = notices.send(Notice::Connected { epoch: link.epoch });
             let mut session = Session::new(self.config, self.skill.clone(), link.epoch);
+            let console = Console {
+                quit: &mut quit,
+                words: &mut words,
+            };
             let end = self
-                .drive(
-                    &mut session,
-                    link,
-                    task,
-                    &mut quit,
-                    &mut words,
-                    notices,
-                    &mut marks,
-                )
+                .drive(&mut session, link, task, console, notices, &mut marks)
                 .await;
             summary.counters.add(session.counters());
             match end {
@@ -289,11 +291,11 @@ impl Daemon {
         session: &mut Session,
         mut link: Link,
         task: &mut Task,
-        quit: &mut watch::Receiver<bool>,
-        words: &mut mpsc::UnboundedReceiver<Word>,
+        console: Console<'_>,
         notices: &mpsc::UnboundedSender<Notice>,
         marks: &mut Marks,
     ) -> End {
+        let Console { quit, words } = console;
         loop {
             if let Err(e) = self.flush(session, &mut link).await {
                 return End::Lost(e.to_string());
@@ -340,7 +342,7 @@ impl Daemon {
             let due = due.into_iter().flatten().min();
             tokio::select! {
                 biased;
-                _ = quit.wait_for(|quit| *quit) => {
+                () = told(quit) => {
                     let _ = self.leave(session, link).await;
                     return End::Quit;
                 }

@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 use clap::Parser;
+use telemime_endpoint::cli::one_line;
 
 /// Teach, drive and play a Telemime robot.
 #[derive(Parser)]
@@ -16,7 +17,7 @@ fn main() -> ExitCode {
     match telemime_operator::cli::run(&Cli::parse().args) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
-            eprintln!("telemime-operator: {e:#}");
+            eprintln!("telemime-operator: {}", one_line(e.chain()));
             ExitCode::FAILURE
         }
     }

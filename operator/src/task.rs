@@ -162,12 +162,15 @@ impl Task {
             }
             Event::Refused(Refusal::Diverged) => {}
             Event::Refused(reason) => self.give_up(format!("the robot declines: {reason:?}")),
-            Event::State(RobotState::Holding, cause) => {
+            // A former operator's stop is not ours.
+            Event::State(RobotState::Holding, cause) if self.phase == Phase::Engaged => {
                 self.give_up(format!(
                     "the arm stopped by itself ({cause:?}) and holds; engage again on purpose"
                 ));
             }
-            Event::State(RobotState::Stopped, _) => self.give_up("emergency stop".into()),
+            Event::State(RobotState::Stopped, _) => self.give_up(
+                "the emergency stop is latched; type reset at either end when it is safe".into(),
+            ),
             Event::State(RobotState::Ready, Cause::PlanFinished) => {
                 self.phase = Phase::Leaving(now.offset_by_secs(LEAVE_S));
             }

@@ -90,13 +90,17 @@ fn parse_fixed(text: &str) -> Result<(String, f64), String> {
 }
 
 /// What the robot prints with `--json`; `docs/commands.md` lists the fields.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
-enum Event<'a> {
+#[expect(
+    missing_docs,
+    reason = "the fields are documented where users look: docs/commands.md"
+)]
+pub enum Event {
     Listening {
         addr: SocketAddr,
         fingerprint: String,
-        arm: &'a str,
+        arm: String,
         joints: usize,
         lag_s: f64,
         radius_m: f64,
@@ -106,14 +110,14 @@ enum Event<'a> {
         peer: SocketAddr,
     },
     Disconnected {
-        why: &'a str,
+        why: String,
         received: u32,
         dropped: u32,
         clock_offset_s: Option<f64>,
         clock_bound_s: Option<f64>,
     },
     Refused {
-        why: &'a str,
+        why: String,
     },
     State {
         state: String,
@@ -129,7 +133,7 @@ enum Event<'a> {
         tip_m: [f64; 3],
     },
     Path {
-        knots: &'a [(f64, [f64; 3], [f64; 3])],
+        knots: Vec<(f64, [f64; 3], [f64; 3])>,
     },
     Servo {
         ticks: u64,
@@ -210,7 +214,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         &Event::Listening {
             addr,
             fingerprint: identity.fingerprint().to_string(),
-            arm: rig.arm.name(),
+            arm: rig.arm.name().to_owned(),
             joints: rig.arm.dof(),
             lag_s: rig.lag_s(),
             radius_m: rig.radius_m,
@@ -272,7 +276,7 @@ struct Log {
 }
 
 impl Log {
-    fn say(self, event: &Event<'_>, text: impl FnOnce() -> String) {
+    fn say(self, event: &Event, text: impl FnOnce() -> String) {
         if self.json {
             emit(event);
         } else {
@@ -326,7 +330,7 @@ async fn listen_to(
                 counters,
             } => {
                 let event = Event::Disconnected {
-                    why: &why,
+                    why: why.clone(),
                     received: counters.received,
                     dropped: counters.dropped,
                     clock_offset_s: clock.map(|c| c.0),
@@ -342,17 +346,17 @@ async fn listen_to(
                     )
                 });
             }
-            Notice::Refused { why } => {
-                log.say(&Event::Refused { why: &why }, || format!("refused {why}"))
-            }
-            Notice::Path(knots) if log.json => log.say(&Event::Path { knots: &knots }, String::new),
+            Notice::Refused { why } => log.say(&Event::Refused { why: why.clone() }, || {
+                format!("refused {why}")
+            }),
+            Notice::Path(knots) if log.json => log.say(&Event::Path { knots }, String::new),
             Notice::Path(_) => {}
         }
     }
     recorder
 }
 
-fn engaged(report: &Report) -> Event<'static> {
+fn engaged(report: &Report) -> Event {
     let q = report.mapping.rotation.as_ref();
     Event::Engaged {
         engagement: report.engagement,
@@ -426,5 +430,23 @@ impl Recorder {
             );
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_documented_configuration_is_understood_and_complete() {
+        let text = include_str!("../../docs/commands.md");
+        let example = text
+            .split("```toml robot\n")
+            .nth(1)
+            .and_then(|rest| rest.split("```").next())
+            .unwrap();
+        let file: File = toml::from_str(example).unwrap();
+        assert!(!format!("{file:?}").contains("None"), "a key is missing");
+        assert_eq!((file.peers.len(), file.fixed["finger_joint"]), (1, 0.02));
     }
 }

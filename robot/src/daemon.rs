@@ -4,13 +4,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use quinn::{Connection, Endpoint, Incoming, SendStream, VarInt};
-use telemime_endpoint::cli::Word;
+use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{Control, ControlError, write_frame};
 use telemime_endpoint::{HostClock, quic};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode, negotiate};
-use telemime_protocol::wire::v1::{self, Cause, Info};
+use telemime_protocol::wire::v1::{self, Cause, Info, RobotState};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep_until};
 
@@ -20,6 +20,15 @@ use crate::session::{Counters, Output, Session, SessionConfig, TickTiming};
 
 /// How often reports are taken from the servo's ring.
 const DRAIN: Duration = Duration::from_millis(4);
+
+/// Close codes (docs/protocol.md): an ordinary end, a malformed control message, a reject, a malformed greeting.
+const CLOSED: u32 = 0;
+const MALFORMED: u32 = 1;
+const REJECTED: u32 = 2;
+const BAD_GREETING: u32 = 3;
+
+/// A stop takes a fraction of a second; after this many drains (2 s) the servo itself must be dead.
+const MAX_STOP_DRAINS: u32 = 500;
 
 /// Connections that may be greeting at the same time.
 const MAX_GREETING: usize = 8;
@@ -101,21 +110,23 @@ impl Daemon {
         loop {
             let ended = self.flush(active.as_mut()).await;
             if let Some(why) = ended {
-                self.end(&mut active, &mut skill, &why, &notices);
+                self.end(&mut active, &mut skill, (why.0, &why.1), &notices);
             }
             let due = active
                 .as_ref()
                 .map(|a| self.clock.instant(a.session.poll_timeout().0));
             tokio::select! {
                 biased;
-                _ = quit.wait_for(|quit| *quit) => break,
+                () = told(&mut quit) => break,
                 Some(word) = words.recv() => self.order(match word {
                     Word::Stop => Order::Stop(Cause::LocalStop),
                     Word::Reset => Order::Reset { operator: active.is_some() },
                 }),
-                _ = drain.tick() => self.drain(active.as_mut(), &notices),
+                _ = drain.tick() => {
+                    self.drain(active.as_mut(), &notices);
+                }
                 why = receive(active.as_mut(), &self.clock) => if let Some(why) = why {
-                    self.end(&mut active, &mut skill, &why, &notices);
+                    self.end(&mut active, &mut skill, (why.0, &why.1), &notices);
                 },
                 () = sleep_until(due.unwrap_or_else(tokio::time::Instant::now)), if due.is_some() => {
                     if let Some(active) = &mut active {
@@ -136,26 +147,32 @@ impl Daemon {
             }
         }
         self.order(Order::Stop(Cause::LocalStop));
+        // Nobody leaves before the arm is at rest; the operator hears of the stop at once.
+        for _ in 0..MAX_STOP_DRAINS {
+            sleep_until(
+                self.clock
+                    .instant(self.clock.now().offset_by_secs(DRAIN.as_secs_f64())),
+            )
+            .await;
+            let at_rest = self.drain(active.as_mut(), &notices);
+            let _ = self.flush(active.as_mut()).await;
+            if at_rest {
+                break;
+            }
+        }
         if let Some(active) = &mut active {
-            // One last drain, so that the operator hears of the stop.
-            self.clock_tick().await;
-            self.drain(Some(active), &notices);
-            let _ = self.flush(Some(active)).await;
             let _ = active.send.finish();
             let _ = tokio::time::timeout(Duration::from_millis(500), active.send.stopped()).await;
         }
-        self.end(&mut active, &mut skill, "the robot daemon stops", &notices);
+        self.end(
+            &mut active,
+            &mut skill,
+            (CLOSED, "the robot daemon stops"),
+            &notices,
+        );
         self.endpoint
             .close(VarInt::from_u32(0), b"the robot daemon stops");
         self.endpoint.wait_idle().await;
-    }
-
-    async fn clock_tick(&self) {
-        sleep_until(
-            self.clock
-                .instant(self.clock.now().offset_by_secs(2.0 * DRAIN.as_secs_f64())),
-        )
-        .await;
     }
 
     /// Gives authority, or says why not.
@@ -229,7 +246,13 @@ impl Daemon {
         let _ = self.servo.orders.push(order);
     }
 
-    fn drain(&mut self, mut active: Option<&mut Active>, notices: &mpsc::UnboundedSender<Notice>) {
+    /// Takes the servo's reports; says whether the newest is of an arm stopped and at rest.
+    fn drain(
+        &mut self,
+        mut active: Option<&mut Active>,
+        notices: &mpsc::UnboundedSender<Notice>,
+    ) -> bool {
+        let mut at_rest = false;
         let timing = self
             .timing
             .as_deref()
@@ -243,28 +266,30 @@ impl Daemon {
             });
         while let Ok(report) = self.servo.reports.pop() {
             self.info.state = report.state;
+            at_rest = report.state == RobotState::Stopped && !report.moving;
             if let Some(active) = active.as_deref_mut() {
                 active.session.handle_report(&report, timing);
             }
             let _ = notices.send(Notice::Report(Box::new(report)));
         }
         while self.servo.spent.pop().is_ok() {}
+        at_rest
     }
 
     /// Does what the session wants; a reason if the session is over.
-    async fn flush(&mut self, active: Option<&mut Active>) -> Option<String> {
+    async fn flush(&mut self, active: Option<&mut Active>) -> Option<(u32, String)> {
         let active = active?;
         while let Some(output) = active.session.poll_output() {
             match output {
                 Output::Control(payload) => {
                     if let Err(e) = write_frame(&mut active.send, &payload).await {
-                        return Some(e.to_string());
+                        return Some((CLOSED, e.to_string()));
                     }
                 }
                 // Too large or unsupported cannot happen (1100 B); a lost connection shows up in `receive`.
                 Output::Datagram(bytes) => drop(active.connection.send_datagram(bytes.into())),
                 Output::Order(order) => self.order(order),
-                Output::Goodbye => return Some("the operator said goodbye".into()),
+                Output::Goodbye => return Some((CLOSED, "the operator said goodbye".into())),
             }
         }
         None
@@ -274,7 +299,7 @@ impl Daemon {
         &mut self,
         active: &mut Option<Active>,
         skill: &mut Option<Arc<Skill>>,
-        why: &str,
+        (code, why): (u32, &str),
         notices: &mpsc::UnboundedSender<Notice>,
     ) {
         let Some(mut ended) = active.take() else {
@@ -286,7 +311,9 @@ impl Daemon {
                 self.order(order);
             }
         }
-        ended.connection.close(VarInt::from_u32(0), why.as_bytes());
+        ended
+            .connection
+            .close(VarInt::from_u32(code), why.as_bytes());
         if let Some(held) = ended.session.skill() {
             *skill = Some(held);
         }
@@ -312,7 +339,7 @@ impl Daemon {
 }
 
 /// The next thing the operator sends; a reason if it is the last. Never resolves without an operator.
-async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<String> {
+async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<(u32, String)> {
     let Some(active) = active else {
         return std::future::pending().await;
     };
@@ -320,17 +347,17 @@ async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<Strin
         biased;
         frame = active.frames.recv() => match frame {
             Some(Ok(frame)) => {
-                active.session.handle_control(clock.now(), &frame).err().map(|e| format!("control message: {e}"))
+                active.session.handle_control(clock.now(), &frame).err().map(|e| (MALFORMED, format!("control message: {e}")))
             }
-            Some(Err(e)) => Some(e.to_string()),
-            None => Some("control stream ended".into()),
+            Some(Err(e)) => Some((CLOSED, e.to_string())),
+            None => Some((CLOSED, "control stream ended".into())),
         },
         datagram = active.connection.read_datagram() => match datagram {
             Ok(bytes) => {
                 active.session.handle_datagram(clock.now(), &bytes);
                 None
             }
-            Err(e) => Some(quic::explain(&e)),
+            Err(e) => Some((CLOSED, quic::explain(&e))),
         },
     }
 }
@@ -376,9 +403,13 @@ async fn greet(
 
 /// Says why there is no session, and closes once that has been read.
 async fn turn_away(connection: Connection, mut control: Control, code: RejectCode, text: String) {
+    let close = match code {
+        RejectCode::Malformed => BAD_GREETING,
+        _ => REJECTED,
+    };
     // The peer may be gone already; there is nobody else to tell.
     let _ = control.write(&Answer::Reject { code, text }.encode()).await;
     let _ = control.send.finish();
     let _ = tokio::time::timeout(Duration::from_secs(2), control.send.stopped()).await;
-    connection.close(VarInt::from_u32(2), b"rejected");
+    connection.close(VarInt::from_u32(close), b"rejected");
 }

@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 use clap::Parser;
+use telemime_endpoint::cli::one_line;
 
 /// Drive an arm for a Telemime operator.
 #[derive(Parser)]
@@ -16,7 +17,7 @@ fn main() -> ExitCode {
     match telemime_robot::cli::run(&Cli::parse().args) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
-            eprintln!("telemime-robot: {e:#}");
+            eprintln!("telemime-robot: {}", one_line(e.chain()));
             ExitCode::FAILURE
         }
     }

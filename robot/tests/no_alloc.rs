@@ -1,4 +1,8 @@
 //! A tick neither allocates nor frees, whatever it is told to do.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy.toml allows it in tests, but does not know these helpers for tests"
+)]
 
 use std::collections::BTreeSet;
 

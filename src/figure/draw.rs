@@ -173,7 +173,7 @@ where
         .draw()
         .map_err(draw_error)?;
     for one in &panel.layers {
-        layer(one, &mut axes, k)?;
+        layer(one, panel.equal_axes, &mut axes, k)?;
     }
     Ok(())
 }
@@ -231,7 +231,12 @@ where
     Ok(if drawn { y + line_h / 2 } else { corner.1 })
 }
 
-fn layer<DB: DrawingBackend>(layer: &Layer, axes: &mut Axes<'_, DB>, k: f64) -> Drawn
+fn layer<DB: DrawingBackend>(
+    layer: &Layer,
+    equal_axes: bool,
+    axes: &mut Axes<'_, DB>,
+    k: f64,
+) -> Drawn
 where
     DB::ErrorType: 'static,
 {
@@ -239,6 +244,12 @@ where
     let line = stroke(layer, k);
     let fill = pale(layer.colour).filled();
     match &layer.shape {
+        // A path turns back on itself, and a mitred join of such a turn is a spike.
+        Shape::Line(p) if equal_axes => {
+            let p: Vec<_> = finite(p).collect();
+            axes.draw_series(p.windows(2).map(|w| PathElement::new(w.to_vec(), line)))
+                .map(|_| ())
+        }
         Shape::Line(p) => axes
             .draw_series(LineSeries::new(finite(p), line))
             .map(|_| ()),

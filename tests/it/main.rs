@@ -1,11 +1,19 @@
 //! Integration tests: one binary, one module a file.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy.toml allows it in tests, but does not know these helpers for tests"
+)]
 
 mod arms;
 mod codec;
+mod commands;
+mod layout;
 mod mirror;
 mod paper;
 mod play;
 mod prediction;
+mod processes;
+mod protocol;
 mod safety;
 mod scene;
 mod strangers;

@@ -1,6 +1,6 @@
 //! Who may speak to the robot, and what it makes of nonsense.
 
-use quinn::{Connection, Endpoint};
+use quinn::{Connection, ConnectionError, Endpoint, VarInt};
 use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use telemime::ground::{Pair, run_virtual};
@@ -103,17 +103,23 @@ fn another_version_and_no_greeting_are_told_why() {
         let link = delayed(0.02);
         let later = hello(VERSION + 1, VERSION + 8);
         let not_ours = b"GET / HTTP/1.1\r\n\r\n".to_vec();
-        for (greeting, expected, word) in [
-            (later, RejectCode::Version, "version"),
-            (not_ours, RejectCode::Malformed, "Telemime"),
+        for (greeting, expected, close, word) in [
+            (later, RejectCode::Version, 2, "version"),
+            (not_ours, RejectCode::Malformed, 3, "Telemime"),
         ] {
             let endpoint = pair.stranger(&link, 34).unwrap();
-            let (_connection, _control, answer) = greet(&endpoint, &pair, &greeting).await;
+            let (connection, control, answer) = greet(&endpoint, &pair, &greeting).await;
             let Answer::Reject { code, text } = answer else {
                 panic!("{answer:?}")
             };
             assert_eq!(code, expected);
             assert!(text.contains(word), "{text}");
+            // Having read the answer, the stream is done with.
+            drop(control);
+            let ConnectionError::ApplicationClosed(closed) = connection.closed().await else {
+                panic!("not closed by the robot")
+            };
+            assert_eq!(closed.error_code, VarInt::from_u32(close));
         }
         let endpoint = pair.stranger(&link, 35).unwrap();
         let (_connection, _control, answer) = greet(&endpoint, &pair, &hello(0, 90)).await;

@@ -2,7 +2,7 @@
 
 use indicatif::{ProgressBar, ProgressStyle};
 use nalgebra::Vector3;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use telemime_endpoint::Mono;
 use telemime_endpoint::cli::emit;
 use telemime_endpoint::meter::Counts;
@@ -13,7 +13,7 @@ use crate::session;
 use crate::task::{Outcome, Task};
 
 /// How well one series follows another: mean absolute and squared error, and R² of the worst axis.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Scores {
     /// Mean absolute error over all axes, m.
     pub mae_m: f64,
@@ -51,7 +51,7 @@ impl Scores {
 }
 
 /// What playing a skill sends.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PlayReport {
     /// The skill.
     pub skill: String,
@@ -67,10 +67,12 @@ pub struct PlayReport {
     pub bytes: usize,
     /// The rebuilt motion against the inferred one.
     pub rebuilt: Scores,
+    /// The checkpoints: time (s) and position (m).
+    pub points: Vec<(f64, [f64; 3])>,
 }
 
 /// What the operator prints with `--json`; `docs/commands.md` lists the fields.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 #[expect(
     missing_docs,
@@ -134,6 +136,7 @@ pub enum Event {
         completed: bool,
         why: Option<String>,
         zero_mono_ns: Option<i64>,
+        epoch_mono_ns: i64,
         samples: u32,
         messages: u32,
         knots: u32,
@@ -157,6 +160,7 @@ impl Event {
             completed: why.is_none(),
             why,
             zero_mono_ns: task.zero().map(|t| t.0 + epoch.0),
+            epoch_mono_ns: epoch.0,
             samples: summary.counters.samples,
             messages: summary.counters.messages,
             knots: summary.counters.knots,

@@ -50,6 +50,11 @@ impl Skills {
                 );
             }
             let skill = learn(&found.name, &kept, &options, log)?;
+            if let Some(folder) = &args.save {
+                std::fs::create_dir_all(folder)
+                    .with_context(|| format!("cannot make {}", folder.display()))?;
+                skill_file::save(&skill, folder.join(format!("{}.skill", skill.name())))?;
+            }
             skills.push(Arc::new(skill))?;
             pooled.extend(kept);
         }
@@ -209,6 +214,7 @@ pub fn infer(skill: &Skill, bound_m: f64) -> anyhow::Result<(Plan<3>, PlayReport
         checkpoints: plan.len(),
         bytes: codec::encode(&plan).len(),
         rebuilt: Scores::of(&inferred, &rebuilt),
+        points: plan.checkpoints().map(|c| (c.t_s, c.x.into())).collect(),
     };
     Ok((plan, report))
 }

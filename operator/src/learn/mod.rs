@@ -12,7 +12,7 @@ mod tests;
 mod trial;
 
 use telemime_protocol::predict::ModelError;
-use telemime_protocol::skill::{Gmm, Provenance, Skill, SkillError, Source};
+use telemime_protocol::skill::{Gmm, MAX_COMPONENTS, Provenance, Skill, SkillError, Source};
 
 use crate::demonstration::Demonstration;
 
@@ -70,7 +70,7 @@ pub struct LearnOptions {
 impl Default for LearnOptions {
     fn default() -> Self {
         Self {
-            motion_components: 2..=20,
+            motion_components: 1..=MAX_COMPONENTS,
             predictor: PredictorOptions::default(),
             seed: 0,
         }

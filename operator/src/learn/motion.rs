@@ -1,18 +1,22 @@
 //! The motion to play: a mixture over time and position, of the aligned demonstrations.
 
-use nalgebra::Vector4;
-use telemime_protocol::skill::Gmm;
+use nalgebra::{SVector, Vector4};
+use telemime_protocol::skill::{Gmm, Gmr};
 
 use super::align::Aligned;
-use super::em::EmOptions;
-use super::select::select;
+use super::em::{self, EmOptions, Fit};
+use super::select::{Candidate, bic_of_means};
 use super::{LearnError, LearnOptions, Progress};
 
 /// More rows than this say nothing new about a smooth motion.
 const MOST_ROWS: usize = 2000;
 
-/// Candidates in a row that may be worse before the search for K ends.
-const PATIENCE: usize = 3;
+/// Numbers of components tried: every small one, then ever larger steps. A motion that goes to and fro
+/// needs a component or two per turn, and any number well below that is worse than one for the whole:
+/// the criterion has a barrier, so the search does not stop at the first candidates that are worse.
+const LADDER: [usize; 20] = [
+    1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20, 24, 28, 33, 39, 46, 54, 64,
+];
 
 /// Rows (t s, x m, y m, z m), demonstration by demonstration, evenly thinned to about [`MOST_ROWS`].
 fn rows(aligned: &Aligned) -> Vec<Vector4<f64>> {
@@ -34,6 +38,11 @@ fn rows(aligned: &Aligned) -> Vec<Vector4<f64>> {
 
 /// Fits the mixture over (t s, x m, y m, z m), its number of components by BIC.
 ///
+/// The criterion judges what the mixture is for: the likelihood is that of the *regression*, a normal
+/// position at each time. By the joint likelihood a motion to and fro is best told as places the hand
+/// keeps returning to, and its regression over time is one long average. For the same reason both starts
+/// (time bins, k-means++) compete by this criterion, and covariances are not counted ([`bic_of_means`]).
+///
 /// # Errors
 /// [`LearnError`], as of the fit.
 pub fn fit(
@@ -42,23 +51,60 @@ pub fn fit(
     progress: &mut impl FnMut(Progress),
 ) -> Result<Gmm<4>, LearnError> {
     let rows = rows(aligned);
-    let em = EmOptions {
-        restarts: 1,
-        seed: options.seed,
-        ..EmOptions::default()
-    };
-    let selection = select(
-        &rows,
-        options.motion_components.clone(),
-        PATIENCE,
-        &em,
-        |candidate| progress(Progress::Candidate(candidate)),
-    )?;
-    let best = selection.best;
+    let mut best: Result<(f64, Fit<4>), LearnError> = Err(LearnError::Components { asked: 0 });
+    for components in LADDER
+        .into_iter()
+        .filter(|k| options.motion_components.contains(k))
+    {
+        for time_bins in [true, false] {
+            let em = EmOptions {
+                components,
+                max_iterations: 60,
+                restarts: usize::from(!time_bins),
+                time_bins,
+                seed: options.seed,
+                ..EmOptions::default()
+            };
+            let judged = em::fit(&rows, &em).and_then(|fit| {
+                let score = regression_score(&fit.gmm, &rows)?;
+                Ok((score, fit))
+            });
+            match judged {
+                Ok((score, fit)) => {
+                    let bic = bic_of_means(components, 4, score, rows.len());
+                    progress(Progress::Candidate(Candidate {
+                        components,
+                        bic,
+                        score,
+                    }));
+                    if best.as_ref().map_or(true, |(least, _)| bic < *least) {
+                        best = Ok((bic, fit));
+                    }
+                }
+                Err(e) => best = best.or(Err(e)),
+            }
+        }
+    }
+    let (_, best) = best?;
     progress(Progress::Motion {
         components: best.gmm.components().len(),
         score: best.score,
         degenerate: best.degenerate,
     });
     Ok(best.gmm)
+}
+
+/// Mean log density (nats a row) of the positions under the regression over time.
+fn regression_score(gmm: &Gmm<4>, rows: &[Vector4<f64>]) -> Result<f64, LearnError> {
+    let gmr = Gmr::<1, 3>::new(gmm).map_err(|_| LearnError::Singular)?;
+    let mut sum = 0.0;
+    for row in rows {
+        let at = gmr.query(&SVector::from([row[0]]));
+        let factor = at.covariance.cholesky().ok_or(LearnError::Singular)?;
+        let error = row.fixed_rows::<3>(1) - at.mean;
+        let distance2 = error.dot(&factor.solve(&error));
+        let log_det: f64 = (0..3).map(|d| factor.l_dirty()[(d, d)].ln()).sum();
+        sum -= 0.5 * distance2 + log_det + 1.5 * std::f64::consts::TAU.ln();
+    }
+    Ok(sum / rows.len() as f64)
 }

@@ -1,7 +1,5 @@
 //! The number of components, by the Bayesian information criterion (Schwarz 1978).
 
-use std::ops::RangeInclusive;
-
 use nalgebra::SVector;
 
 use super::LearnError;
@@ -34,7 +32,16 @@ pub fn bic(components: usize, dimensions: usize, score: f64, rows: usize) -> f64
     -2.0 * score * n + parameters * n.ln()
 }
 
-/// Fits every number of components in `range` and keeps the one of smallest criterion.
+/// [`bic`] that counts weights and means only, `p = K−1 + K·D`.
+///
+/// Covariances of neighbouring components describe the same spread over and over; counted in full they
+/// outweigh everything a motion that goes to and fro has to tell, and what is left is its average.
+pub fn bic_of_means(components: usize, dimensions: usize, score: f64, rows: usize) -> f64 {
+    let (k, d, n) = (components as f64, dimensions as f64, rows as f64);
+    -2.0 * score * n + (k - 1.0 + k * d) * n.ln()
+}
+
+/// Fits every number of components in `candidates` and keeps the one of smallest criterion.
 ///
 /// Stops early when `patience` candidates in a row were worse than the best so far; numbers that the
 /// rows cannot support are left out. `options.components` does not apply.
@@ -43,7 +50,7 @@ pub fn bic(components: usize, dimensions: usize, score: f64, rows: usize) -> f64
 /// As [`em::fit`], if no candidate could be fitted.
 pub fn select<const D: usize>(
     data: &[SVector<f64, D>],
-    range: RangeInclusive<usize>,
+    candidates: impl IntoIterator<Item = usize>,
     patience: usize,
     options: &EmOptions,
     mut progress: impl FnMut(Candidate),
@@ -51,7 +58,7 @@ pub fn select<const D: usize>(
     let mut table: Vec<Candidate> = Vec::new();
     let mut best: Result<(f64, Fit<D>), LearnError> = Err(LearnError::Components { asked: 0 });
     let mut worse = 0;
-    for components in range {
+    for components in candidates {
         let fit = em::fit(
             data,
             &EmOptions {

@@ -38,6 +38,23 @@ pub fn resolve(text: &str) -> Result<SocketAddr, String> {
         .ok_or_else(|| format!("`{text}` has no address"))
 }
 
+/// An error and its causes in one line, each said once: a cause that the text before it quotes is left out.
+pub fn one_line<'a>(
+    chain: impl IntoIterator<Item = &'a (dyn std::error::Error + 'static)>,
+) -> String {
+    let mut line = String::new();
+    for cause in chain {
+        let text = cause.to_string();
+        if !line.contains(&text) {
+            if !line.is_empty() {
+                line.push_str(": ");
+            }
+            line.push_str(&text);
+        }
+    }
+    line.replace('\n', " ")
+}
+
 /// Prints `event` as one line of JSON on stdout. A reader that has gone away is not our concern.
 pub fn emit(event: &impl Serialize) {
     if let Ok(line) = serde_json::to_string(event) {
@@ -53,6 +70,11 @@ pub enum Word {
     Stop,
     /// `reset`: leave the latched stop.
     Reset,
+}
+
+/// Resolves once the watch is true, or its sender is gone.
+pub async fn told(quit: &mut watch::Receiver<bool>) {
+    let _ = quit.wait_for(|quit| *quit).await;
 }
 
 /// Ctrl-C, SIGTERM, `quit`, or (if asked for) the end of stdin turn the watch true; `stop` and `reset` arrive
@@ -95,4 +117,29 @@ pub fn listen(
         std::mem::forget(word_tx);
     }
     Ok((quit, words))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, thiserror::Error)]
+    #[error("key.pem: {source}")]
+    struct Quoting {
+        source: std::io::Error,
+    }
+
+    #[test]
+    fn a_quoted_cause_is_not_said_twice() {
+        let error = Quoting {
+            source: std::io::Error::other("no such file"),
+        };
+        let chain: [&(dyn std::error::Error + 'static); 2] = [&error, &error.source];
+        assert_eq!(one_line(chain), "key.pem: no such file");
+        assert_eq!(
+            resolve("127.0.0.1:80"),
+            Ok(SocketAddr::from(([127, 0, 0, 1], 80)))
+        );
+        assert!(resolve("127.0.0.1").is_err());
+    }
 }

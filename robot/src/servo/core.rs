@@ -119,6 +119,8 @@ pub struct Report {
     pub engagement: u32,
     /// When it began.
     pub engaged_at: Mono,
+    /// The engagement declined last, and when: the arm had begun to move, or a stop came first.
+    pub declined: (u32, Mono),
     /// Its mapping.
     pub mapping: Mapping,
     /// The arm still moves.
@@ -212,6 +214,7 @@ pub struct Core {
     mapping: Mapping,
     engagement: u32,
     engaged_at: Mono,
+    declined: (u32, Mono),
     clamps: u32,
     out_of_reach: bool,
     tick: u64,
@@ -241,6 +244,7 @@ impl Core {
             mapping,
             engagement: 0,
             engaged_at: Mono(0),
+            declined: (0, Mono(i64::MIN)),
             clamps: 0,
             out_of_reach: false,
             tick: 0,
@@ -314,6 +318,7 @@ impl Core {
             Source::Play(trajectory) => Drive::Play(trajectory),
         };
         if self.moving || !self.safety.engage(now, engagement.lease_s) {
+            self.declined = (engagement.number, now);
             self.discard(drive);
             return;
         }
@@ -354,12 +359,12 @@ impl Core {
             return Demand::Stop;
         }
         let since_s = now.secs_since(self.engaged_at);
-        let hand_m = match &self.drive {
+        // A hand is in the middle of a motion; a plan begins where the tip is.
+        let (hand_m, eased) = match &self.drive {
             Drive::Nothing => return Demand::Stop,
             Drive::Mirror { forecast, valid_at } => {
-                forecast
-                    .at(now.secs_since(*valid_at) + self.config.lag_s)
-                    .position
+                let horizon_s = now.secs_since(*valid_at) + self.config.lag_s;
+                (forecast.at(horizon_s).position, ramp(since_s / RAMP_S))
             }
             Drive::Play(trajectory) => {
                 if since_s > trajectory.duration_s + SETTLE_S {
@@ -367,15 +372,13 @@ impl Core {
                     return Demand::Stop;
                 }
                 let t_s = (since_s + self.config.lag_s).min(trajectory.duration_s);
-                trajectory
-                    .spline
-                    .eval(t_s)
-                    .map_or(self.mapping.hand_m, |jet| jet.x)
+                let jet = trajectory.spline.eval(t_s);
+                (jet.map_or(self.mapping.hand_m, |jet| jet.x), 1.0)
             }
         };
         let (placed, clamped) = self.mapping.place(hand_m, self.config.radius_m);
         self.out_of_reach = clamped;
-        self.target_m = self.mapping.tip_m + (placed - self.mapping.tip_m) * ramp(since_s / RAMP_S);
+        self.target_m = self.mapping.tip_m + (placed - self.mapping.tip_m) * eased;
         Demand::Follow {
             target: self.target_m,
             speed_scale: self.safety.speed_scale(now),
@@ -395,6 +398,7 @@ impl Core {
             transitions: self.safety.transitions(),
             engagement: self.engagement,
             engaged_at: self.engaged_at,
+            declined: self.declined,
             mapping: self.mapping,
             moving: self.moving,
             age_s,

@@ -280,6 +280,16 @@ impl Session {
                 tip_m: report.mapping.tip_m.cast::<f32>().into(),
             });
         }
+        if self.acknowledged != self.engagement
+            && report.declined.0 == self.engagement
+            && report.declined.1 >= self.requested_at
+        {
+            self.acknowledged = self.engagement;
+            self.refuse(match report.state {
+                RobotState::Stopped => Refusal::Stopped,
+                _ => Refusal::Moving,
+            });
+        }
         if changed {
             self.send(&RobotControl::State {
                 state: report.state,
@@ -382,7 +392,10 @@ impl Session {
                     .filter(|(id, _)| id == plan)
                     .ok_or(Refusal::BadPlan)?;
                 let spline = held.spline().map_err(|_| Refusal::BadPlan)?;
-                let duration_s = spline.span_s().1;
+                let (start_s, duration_s) = spline.span_s();
+                if start_s != 0.0 {
+                    return Err(Refusal::BadPlan);
+                }
                 (
                     Source::Play(Box::new(Trajectory { spline, duration_s })),
                     None,

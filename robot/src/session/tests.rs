@@ -63,6 +63,7 @@ fn report(state: RobotState) -> Report {
         transitions: state as u32,
         engagement: 0,
         engaged_at: Mono(0),
+        declined: (0, Mono(i64::MIN)),
         mapping: Mapping {
             scale: 0.1,
             rotation: UnitQuaternion::identity(),

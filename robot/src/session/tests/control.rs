@@ -88,6 +88,25 @@ fn another_sessions_engagement_of_the_same_number_is_no_acknowledgement() {
 }
 
 #[test]
+fn an_engage_the_servo_declines_is_answered() {
+    let mut bench = Bench::ready(None);
+    let engage = bench.mirror(1);
+    bench.engage(&engage);
+    bench.forget();
+    let declined = |at| Report {
+        declined: (1, at),
+        moving: true,
+        ..report(RobotState::Ready)
+    };
+    bench.report(&declined(Mono(bench.now.0 - 5000 * MS)));
+    assert_eq!(bench.control, [], "another session's");
+    bench.report(&declined(bench.now));
+    bench.report(&declined(bench.now));
+    let reason = Refusal::Moving;
+    assert_eq!(bench.control, [RobotControl::Refused { reason }]);
+}
+
+#[test]
 fn the_arms_state_decides_whether_it_may_engage() {
     let mut bench = Bench::fresh(None);
     for _ in 0..4 {
@@ -281,7 +300,7 @@ fn a_stop_is_ordered_and_confirmed_even_on_top_of_a_stop() {
         state: RobotState::Stopped,
         cause: Cause::OperatorStop,
     };
-    assert_eq!(bench.control, [confirmation.clone()]);
+    assert_eq!(bench.control, std::slice::from_ref(&confirmation));
     bench.forget();
 
     bench.control(&OperatorControl::EmergencyStop);

@@ -1,0 +1,183 @@
+//! The command line.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use clap::{Parser, Subcommand};
+use telemime_endpoint::HostClock;
+use telemime_endpoint::cli::{self as shell, one_line};
+use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
+
+use crate::relay::{Passage, Relay, RelayConfig};
+use crate::{demo, paper, teach};
+
+/// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
+/// network delay behind it.
+///
+/// Without a command it runs the demo: two daemons, a bad link between them, and what is left of the delay.
+#[derive(Parser)]
+#[command(version, name = "telemime", args_conflicts_with_subcommands = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Option<Command>,
+    #[command(flatten)]
+    demo: demo::Args,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Both daemons as two processes over a shaped link, and what became of the delay.
+    Demo(demo::Args),
+    /// Learn a skill from a folder of demonstrations and save it.
+    Learn(teach::LearnArgs),
+    /// Show what a saved skill holds.
+    Inspect(teach::InspectArgs),
+    /// The operator daemon: teach, drive, play.
+    Operator(telemime_operator::cli::Args),
+    /// The robot daemon: an arm that follows.
+    Robot(telemime_robot::cli::Args),
+    /// A UDP relay that delays, loses and throttles what passes.
+    Link(LinkArgs),
+    /// Reproduce the tables of the source publication beside ours.
+    Paper(paper::Args),
+}
+
+/// What a link does to packets, in either direction.
+#[derive(clap::Args, Debug, Clone)]
+pub(crate) struct Shape {
+    /// Delay one way.
+    #[arg(long, value_name = "TIME", default_value = "100ms", value_parser = parse_duration_s)]
+    pub(crate) delay: f64,
+    /// Uniform spread around the delay; it reorders.
+    #[arg(long, value_name = "TIME", default_value = "10ms", value_parser = parse_duration_s)]
+    pub(crate) jitter: f64,
+    /// Share of packets lost.
+    #[arg(long, value_name = "P", default_value = "1%", value_parser = parse_probability)]
+    pub(crate) loss: f64,
+    /// Bottleneck [default: unlimited].
+    #[arg(long, value_name = "RATE", value_parser = parse_rate_bit_s)]
+    pub(crate) rate: Option<f64>,
+    /// Seed of the link's chances.
+    #[arg(long, default_value_t = 1)]
+    pub(crate) link_seed: u64,
+}
+
+impl Shape {
+    pub(crate) fn config(&self) -> LinkConfig {
+        LinkConfig {
+            delay_s: self.delay,
+            jitter_s: self.jitter,
+            loss: self.loss,
+            rate_bit_s: self.rate,
+            ..LinkConfig::default()
+        }
+    }
+}
+
+/// A UDP relay that delays, loses and throttles what passes, the same in both directions.
+#[derive(clap::Args, Debug)]
+struct LinkArgs {
+    /// Where the operator sends to.
+    #[arg(long, value_name = "ADDR")]
+    listen: SocketAddr,
+    /// Where the robot listens.
+    #[arg(long, value_name = "HOST:PORT", value_parser = shell::resolve)]
+    to: SocketAddr,
+    #[command(flatten)]
+    shape: Shape,
+    /// Write every packet's fate to this CSV file.
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
+}
+
+/// Parses the command line and runs it; the exit code is 0, 1 (failed, with one line on stderr) or 2 (usage).
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let done = match &cli.command {
+        None => demo::run(&cli.demo),
+        Some(Command::Demo(args)) => demo::run(args),
+        Some(Command::Learn(args)) => teach::learn(args),
+        Some(Command::Inspect(args)) => teach::inspect(args),
+        Some(Command::Operator(args)) => telemime_operator::cli::run(args),
+        Some(Command::Robot(args)) => telemime_robot::cli::run(args),
+        Some(Command::Link(args)) => link(args),
+        Some(Command::Paper(args)) => paper::run(args),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => {
+            eprintln!("telemime: {}", one_line(e.chain()));
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn link(args: &LinkArgs) -> anyhow::Result<()> {
+    let mut record = match &args.record {
+        None => None,
+        Some(path) => {
+            let mut out = csv::Writer::from_path(path)
+                .with_context(|| format!("cannot write {}", path.display()))?;
+            out.write_record(["mono_ns", "direction", "bytes", "delay_s"])?;
+            Some(out)
+        }
+    };
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
+    let (mut passed, mut lost) = (0u64, 0u64);
+    let result = runtime.block_on(async {
+        let (quit, _words) = shell::listen(false)?;
+        let config = RelayConfig {
+            listen: args.listen,
+            to: args.to,
+            up: args.shape.config(),
+            down: args.shape.config(),
+            seed: args.shape.link_seed,
+        };
+        let relay = Relay::bind(config, HostClock::new())
+            .await
+            .with_context(|| {
+                format!(
+                    "cannot listen on {}: choose another --listen, or stop what uses it",
+                    args.listen
+                )
+            })?;
+        println!(
+            "relaying {} to {}; Ctrl-C ends it",
+            relay.local_addr()?,
+            args.to
+        );
+        let mut trouble = None;
+        relay
+            .run(quit, |passage: Passage| {
+                *(if passage.out.is_some() {
+                    &mut passed
+                } else {
+                    &mut lost
+                }) += 1;
+                if let Some(out) = &mut record {
+                    let delay_s = passage
+                        .out
+                        .map_or(String::new(), |t| t.secs_since(passage.at).to_string());
+                    let direction = if passage.up { "up" } else { "down" };
+                    let row = [
+                        &passage.at.0.to_string(),
+                        direction,
+                        &passage.len_bytes.to_string(),
+                        &delay_s,
+                    ];
+                    trouble = trouble.take().or(out.write_record(row).err());
+                }
+            })
+            .await;
+        trouble.map_or(Ok(()), |e| Err(anyhow::Error::from(e)))
+    });
+    println!("{passed} packets passed, {lost} lost");
+    if let Some(mut out) = record {
+        out.flush()?;
+    }
+    result
+}

@@ -1,0 +1,297 @@
+//! Hand against tip at the same wall time; `docs/experiments.md` has the definitions.
+
+use std::path::Path;
+
+use anyhow::{Context, bail};
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use telemime_operator::cli::Event as Operator;
+use telemime_protocol::checkpoint::path::DecodedKnot;
+use telemime_protocol::spline::HermiteSpan;
+use telemime_protocol::time::Stamp;
+use telemime_robot::cli::Event as Robot;
+use telemime_robot::rig::{Rig, RigOptions};
+use telemime_robot::servo::{Mapping, RAMP_S};
+
+use super::processes::Run;
+use super::{Args, Material};
+use crate::measure::{Track, follow, rmse_m, sample_and_hold};
+
+/// One way of following the hand.
+pub(super) struct Way {
+    pub(super) track: Track,
+    pub(super) rmse_m: f64,
+    pub(super) lag_s: f64,
+}
+
+/// The figures of a run.
+pub(super) struct Verdict {
+    pub(super) mapping: Mapping,
+    /// The judged times, s from the recording's beginning, every millisecond.
+    pub(super) grid_s: Vec<f64>,
+    pub(super) truth: Track,
+    /// Raw samples, delayed: an ideal tip.
+    pub(super) delayed: Way,
+    /// The same, through the same arm and filter.
+    pub(super) delayed_arm: Way,
+    /// Perfect knowledge through the same arm and filter.
+    pub(super) floor: Way,
+    /// What the robot did.
+    pub(super) predicted: Way,
+    pub(super) clamps: u32,
+    pub(super) coasted: u32,
+    pub(super) path: Vec<DecodedKnot>,
+    /// Largest distance of the recorded path from the samples it covers, m, and how many it covers.
+    pub(super) path_error_m: f64,
+    pub(super) path_samples: usize,
+}
+
+impl Verdict {
+    /// Share of the delay's cost that is gone; the arm's own limits are not the delay's fault.
+    pub(super) fn fraction_hidden(&self) -> f64 {
+        let (delayed, floor) = (self.delayed_arm.rmse_m, self.floor.rmse_m);
+        (delayed - self.predicted.rmse_m) / (delayed - floor)
+    }
+}
+
+/// One tick of the robot's record.
+pub(super) struct Tick {
+    pub(super) mono_ns: i64,
+    pub(super) tip_m: Vector3<f64>,
+    pub(super) clamps: u32,
+}
+
+/// The ticks of the first engagement, in order.
+pub(super) fn read_ticks(path: &Path, from_ns: i64) -> anyhow::Result<Vec<Tick>> {
+    let mut reader =
+        csv::Reader::from_path(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let headers = reader.headers()?.clone();
+    let column = |name: &str| {
+        headers
+            .iter()
+            .position(|h| h == name)
+            .with_context(|| format!("{}: no column {name}", path.display()))
+    };
+    let (mono, clamps) = (column("mono_ns")?, column("clamps")?);
+    let tip = [column("tip_x")?, column("tip_y")?, column("tip_z")?];
+    let mut ticks = Vec::new();
+    for row in reader.records() {
+        let row = row?;
+        let mono_ns: i64 = row[mono].parse()?;
+        if mono_ns >= from_ns {
+            let tip_m = Vector3::new(
+                row[tip[0]].parse()?,
+                row[tip[1]].parse()?,
+                row[tip[2]].parse()?,
+            );
+            ticks.push(Tick {
+                mono_ns,
+                tip_m,
+                clamps: row[clamps].parse()?,
+            });
+        }
+    }
+    if ticks.is_empty() {
+        bail!("{}: no tick after the engage", path.display());
+    }
+    Ok(ticks)
+}
+
+/// The mapping and the instant of the first engagement.
+pub(super) fn engagement(run: &Run) -> anyhow::Result<(Mapping, i64)> {
+    let found = run.robot.iter().find_map(|e| match e {
+        Robot::Engaged {
+            mono_ns,
+            scale,
+            rotation: [w, x, y, z],
+            hand_m,
+            tip_m,
+            ..
+        } => {
+            let rotation = UnitQuaternion::from_quaternion(Quaternion::new(*w, *x, *y, *z));
+            let (hand_m, tip_m) = (Vector3::from(*hand_m), Vector3::from(*tip_m));
+            Some((
+                Mapping {
+                    scale: *scale,
+                    rotation,
+                    hand_m,
+                    tip_m,
+                },
+                *mono_ns,
+            ))
+        }
+        _ => None,
+    });
+    found.context("the robot never engaged")
+}
+
+/// The same arm as the robot's, for baselines.
+pub(super) fn rig(args: &Args) -> anyhow::Result<Rig> {
+    let mut options = RigOptions {
+        urdf: args.urdf.clone(),
+        ..RigOptions::default()
+    };
+    options.load.tip = args.tip.clone();
+    Ok(Rig::load(&options)?)
+}
+
+pub(super) fn judge(args: &Args, material: &Material, run: &Run) -> anyhow::Result<Verdict> {
+    let rig = rig(args)?;
+    let (mapping, engaged_ns) = engagement(run)?;
+    let zero_ns = run
+        .operator
+        .iter()
+        .find_map(|e| {
+            if let Operator::Done { zero_mono_ns, .. } = e {
+                *zero_mono_ns
+            } else {
+                None
+            }
+        })
+        .context("the operator never started its recording")?;
+    let time_s = |mono_ns: i64| (mono_ns - zero_ns) as f64 * 1e-9;
+
+    let samples = material.recording.samples();
+    let t0_s = samples[0].t_s;
+    let truth = Track::new(samples.iter().map(|s| (s.t_s - t0_s, s.position)).collect())?;
+    let end_s = truth.span_s().1;
+    let engaged_s = time_s(engaged_ns);
+    let from_s = (engaged_s + RAMP_S).max(0.0);
+    if from_s >= end_s {
+        bail!("the robot engaged only {engaged_s:.1} s into a recording of {end_s:.1} s");
+    }
+    let grid_s: Vec<f64> = (0..((end_s - from_s) * 1e3) as u32)
+        .map(|i| from_s + f64::from(i) * 1e-3)
+        .collect();
+
+    let ticks = read_ticks(&run.ticks, engaged_ns)?;
+    let tip = ticks
+        .iter()
+        .map(|t| (time_s(t.mono_ns), mapping.unplace(t.tip_m)));
+    let tip = Track::new(tip.collect())?;
+    let clamps = ticks
+        .iter()
+        .take_while(|t| time_s(t.mono_ns) <= end_s)
+        .last()
+        .map_or(0, |t| t.clamps);
+
+    let arrivals = raw_arrivals(run, &truth, zero_ns);
+    let held = |t_s: f64| sample_and_hold(&arrivals, t_s).unwrap_or(truth.at(0.0));
+    let delayed = Track::new(grid_s.iter().map(|&t| (t, held(t))).collect())?;
+    let way = |track: Track| Way {
+        rmse_m: rmse_m(&track, &truth, &grid_s),
+        lag_s: track.lag_behind(&truth, &grid_s).0,
+        track,
+    };
+    let lag_s = rig.lag_s();
+    let start_s = engaged_s.min(0.0);
+    let delayed_arm = follow(&rig, &mapping, start_s, end_s, |t| Some(held(t))).tip;
+    let floor = follow(&rig, &mapping, start_s, end_s, |t| {
+        Some(truth.at(t + lag_s))
+    })
+    .tip;
+
+    let path = received_path(run);
+    let (path_error_m, path_samples) = path_error(&path, &truth, zero_ns, run);
+    Ok(Verdict {
+        mapping,
+        delayed: way(delayed),
+        delayed_arm: way(delayed_arm),
+        floor: way(floor),
+        predicted: way(tip),
+        clamps,
+        coasted: count_state(run, "Coasting"),
+        path,
+        path_error_m,
+        path_samples,
+        grid_s,
+        truth,
+    })
+}
+
+fn count_state(run: &Run, name: &str) -> u32 {
+    run.robot
+        .iter()
+        .filter(|e| matches!(e, Robot::State { state, .. } if state == name))
+        .count() as u32
+}
+
+/// When each raw sample would have arrived: with the fate that the relay recorded for the packet
+/// that passed it next to the sample's time.
+fn raw_arrivals(run: &Run, truth: &Track, zero_ns: i64) -> Vec<(f64, f64, Vector3<f64>)> {
+    let mut up: Vec<_> = run
+        .passages
+        .iter()
+        .filter(|p| p.up)
+        .map(|p| {
+            (
+                (p.at.0 - zero_ns) as f64 * 1e-9,
+                p.out.map(|out| out.secs_since(p.at)),
+            )
+        })
+        .collect();
+    up.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let nearest = |t_s: f64| {
+        let after = up.partition_point(|p| p.0 < t_s);
+        let candidates = [after.checked_sub(1).and_then(|i| up.get(i)), up.get(after)];
+        candidates
+            .into_iter()
+            .flatten()
+            .min_by(|a, b| (a.0 - t_s).abs().total_cmp(&(b.0 - t_s).abs()))
+            .and_then(|p| p.1)
+    };
+    truth
+        .points()
+        .iter()
+        .filter_map(|&(t_s, x)| nearest(t_s).map(|delay_s| (t_s + delay_s, t_s, x)))
+        .collect()
+}
+
+fn received_path(run: &Run) -> Vec<DecodedKnot> {
+    let knots = run.robot.iter().find_map(|e| {
+        if let Robot::Path { knots } = e {
+            Some(knots)
+        } else {
+            None
+        }
+    });
+    let decode = |(t_s, x, v): &(f64, [f64; 3], [f64; 3])| DecodedKnot {
+        t: Stamp::from_secs_f64(*t_s),
+        x: Vector3::from(*x),
+        v: Vector3::from(*v),
+    };
+    knots.map_or_else(Vec::new, |knots| knots.iter().map(decode).collect())
+}
+
+/// The path's largest distance from the recording's samples between its first and last knot.
+///
+/// Knots are on the session clock, whose zero on the host's clock the operator states.
+fn path_error(path: &[DecodedKnot], truth: &Track, zero_ns: i64, run: &Run) -> (f64, usize) {
+    let epoch_ns = run.operator.iter().find_map(|e| {
+        if let Operator::Done { epoch_mono_ns, .. } = e {
+            Some(*epoch_mono_ns)
+        } else {
+            None
+        }
+    });
+    let Some(epoch_ns) = epoch_ns else {
+        return (0.0, 0);
+    };
+    let offset_s = (epoch_ns - zero_ns) as f64 * 1e-9;
+    let (mut worst_m, mut covered) = (0.0_f64, 0);
+    for &(t_s, x) in truth.points() {
+        let session_s = t_s - offset_s;
+        let after = path.partition_point(|k| k.t.as_secs_f64() < session_s);
+        let (Some(a), Some(b)) = (
+            after.checked_sub(1).and_then(|i| path.get(i)),
+            path.get(after),
+        ) else {
+            continue;
+        };
+        let span = HermiteSpan::new(b.t.secs_since(a.t), [a.x, a.v], [b.x, b.v]);
+        if let Some(jet) = span.and_then(|s| s.eval(session_s - a.t.as_secs_f64())) {
+            worst_m = worst_m.max((jet.x - x).norm());
+            covered += 1;
+        }
+    }
+    (worst_m, covered)
+}

@@ -1,0 +1,158 @@
+//! `telemime demo`: a robot and an operator as two processes, a bad link between them, and what is left
+//! of the delay.
+
+mod figures;
+mod judge;
+mod play;
+mod processes;
+mod summary;
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use nalgebra::Vector3;
+use telemime_operator::cli::Axes;
+use telemime_operator::demonstration::{Demonstration, Demonstrations, Sample};
+use telemime_sim::hand::swing;
+
+use crate::cli::Shape;
+
+/// Performances the demo learns from; one more is driven.
+const PERFORMANCES: u32 = 5;
+
+/// Both daemons as two processes over a shaped link, and what became of the delay.
+///
+/// Learns a skill from five performances of an arm swing (generated, or your own with --demos), then
+/// teleoperates a sixth one, never learned from, across a link of 100 ms ± 10 ms and 1 % loss each way.
+#[derive(clap::Args, Debug, Clone)]
+pub(crate) struct Args {
+    /// Play the learned skill instead of mirroring a live hand.
+    #[arg(long)]
+    play: bool,
+    /// Learn from this folder of recordings (CSV: t,x,y,z) instead.
+    #[arg(long, value_name = "DIR")]
+    demos: Option<PathBuf>,
+    /// Of that folder, only the files whose names match this pattern (* stands for anything).
+    #[arg(long = "match", value_name = "PATTERN", requires = "demos")]
+    matching: Option<String>,
+    /// Drive this recording; it is never learned from [default: the last one of --demos].
+    #[arg(long, value_name = "FILE")]
+    replay: Option<PathBuf>,
+    /// The arm [default: a 7-axis arm of our own].
+    #[arg(long, value_name = "FILE")]
+    urdf: Option<PathBuf>,
+    /// The link that follows the hand.
+    #[arg(long, value_name = "LINK")]
+    tip: Option<String>,
+    /// The recordings' axes.
+    #[arg(long, value_enum, default_value_t = Axes::Kinect)]
+    axes: Axes,
+    /// Tip metres per hand metre [default: from the demonstrations and the arm's limits].
+    #[arg(long)]
+    scale: Option<f64>,
+    /// Which person performs, and how.
+    #[arg(long, default_value_t = 7)]
+    seed: u64,
+    #[command(flatten)]
+    link: Shape,
+    /// Where figures and logs go.
+    #[arg(long, value_name = "DIR", default_value = "runs/demo")]
+    out: PathBuf,
+    /// Print one JSON object to stdout and everything else to stderr.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What is learned and what is driven.
+struct Material {
+    demos: PathBuf,
+    matching: Option<String>,
+    replay: PathBuf,
+    recording: Demonstration,
+    what: String,
+}
+
+/// Runs `telemime demo`.
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    let scratch = tempfile::tempdir().context("no temporary folder")?;
+    let material = material(args, scratch.path())?;
+    std::fs::create_dir_all(&args.out)
+        .with_context(|| format!("cannot make {}", args.out.display()))?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
+    let run = runtime.block_on(processes::run(args, &material, scratch.path()))?;
+    if args.play {
+        play::report(args, &material, &run)
+    } else {
+        let verdict = judge::judge(args, &material, &run)?;
+        let shown = figures::mirror(args, &material, &run, &verdict)?;
+        summary::print(args, &material, &run, &verdict, &shown)
+    }
+}
+
+fn material(args: &Args, scratch: &Path) -> anyhow::Result<Material> {
+    let Some(demos) = args.demos.clone() else {
+        if args.replay.is_some() {
+            bail!("--replay needs --demos: which recordings is the skill learned from?");
+        }
+        return generated(args.seed, scratch);
+    };
+    let found = Demonstrations::read_dir(&demos, args.matching.as_deref())?;
+    let (replay, recording) = match &args.replay {
+        Some(path) => (path.clone(), Demonstration::read_csv(path)?),
+        None => match found.demonstrations.as_slice() {
+            [_, .., last] => (last.path().to_owned(), last.clone()),
+            _ => bail!(
+                "{}: one recording to learn from and another to drive are needed",
+                demos.display()
+            ),
+        },
+    };
+    let what = format!(
+        "{} (your recordings), driving {}",
+        found.name,
+        recording.name()
+    );
+    Ok(Material {
+        demos,
+        matching: args.matching.clone(),
+        replay,
+        recording,
+        what,
+    })
+}
+
+/// A synthetic person waving: performances 0 to 4 to learn from, 5 to drive.
+fn generated(seed: u64, scratch: &Path) -> anyhow::Result<Material> {
+    let demos = scratch.join("swing");
+    std::fs::create_dir(&demos)?;
+    let replay = scratch.join("unseen.csv");
+    for index in 0..=PERFORMANCES {
+        let samples: Vec<_> = swing(seed, index)
+            .into_iter()
+            .map(|(t_s, x)| Sample {
+                t_s,
+                position: Vector3::from(x),
+            })
+            .collect();
+        let path = if index < PERFORMANCES {
+            demos.join(format!("{index}.csv"))
+        } else {
+            replay.clone()
+        };
+        std::fs::write(
+            &path,
+            Demonstration::from_samples(&path, &samples)?.to_csv(),
+        )?;
+    }
+    let recording = Demonstration::read_csv(&replay)?;
+    let what = format!("an arm swing, {PERFORMANCES} generated performances, driving one more");
+    Ok(Material {
+        demos,
+        matching: None,
+        replay,
+        recording,
+        what,
+    })
+}

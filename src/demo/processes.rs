@@ -1,0 +1,258 @@
+//! The two processes and the relay between them, from first to last.
+
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use indicatif::{ProgressBar, ProgressStyle};
+use serde::de::DeserializeOwned;
+use telemime_endpoint::{HostClock, Identity};
+use telemime_operator::cli::Event as Operator;
+use telemime_robot::cli::Event as Robot;
+use tokio::io::{AsyncBufReadExt, BufReader, Lines};
+use tokio::process::{Child, ChildStdout, Command};
+use tokio::sync::watch;
+use tokio::time::timeout;
+
+use super::{Args, Material};
+use crate::relay::{Passage, Relay, RelayConfig};
+
+/// A process that is asked to end gets this long before it is killed.
+const GRACE: Duration = Duration::from_secs(5);
+
+/// What a run leaves behind.
+pub(super) struct Run {
+    pub(super) robot: Vec<Robot>,
+    pub(super) operator: Vec<Operator>,
+    pub(super) passages: Vec<Passage>,
+    /// Every tick of the robot.
+    pub(super) ticks: PathBuf,
+    /// What was learned.
+    pub(super) skill: PathBuf,
+}
+
+struct Process {
+    name: &'static str,
+    child: Child,
+    lines: Lines<BufReader<ChildStdout>>,
+}
+
+impl Process {
+    /// Starts this very program as one of the daemons. It ends when we do: its stdin is ours.
+    fn start(name: &'static str, args: &[String]) -> anyhow::Result<Self> {
+        let program = std::env::current_exe().context("where is this program?")?;
+        let mut child = Command::new(program)
+            .arg(name)
+            .args(args)
+            .args(["--json", "--follow-stdin"])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .kill_on_drop(true)
+            .spawn()
+            .with_context(|| format!("cannot start the {name}"))?;
+        let stdout = child.stdout.take().context("no pipe")?;
+        Ok(Self {
+            name,
+            child,
+            lines: BufReader::new(stdout).lines(),
+        })
+    }
+
+    /// The next event; `None` once the process has closed its stdout.
+    async fn next<E: DeserializeOwned>(&mut self) -> anyhow::Result<Option<E>> {
+        let Some(line) = self.lines.next_line().await? else {
+            return Ok(None);
+        };
+        let event =
+            serde_json::from_str(&line).with_context(|| format!("{} says: {line}", self.name))?;
+        Ok(Some(event))
+    }
+
+    /// Closes its stdin, which ends it, and collects what it still says.
+    async fn finish<E: DeserializeOwned>(mut self, events: &mut Vec<E>) -> anyhow::Result<()> {
+        drop(self.child.stdin.take());
+        let rest = async {
+            while let Some(event) = self.next().await? {
+                events.push(event);
+            }
+            anyhow::Ok(self.child.wait().await?)
+        };
+        match timeout(GRACE, rest).await {
+            Ok(done) => done.map(|_| ()),
+            Err(_) => {
+                self.child.kill().await?;
+                bail!(
+                    "the {} did not end when asked to, and was killed",
+                    self.name
+                )
+            }
+        }
+    }
+}
+
+fn text(path: &Path) -> String {
+    path.to_string_lossy().into_owned()
+}
+
+/// Flag and value, if there is a value.
+fn flag<T: ToString>(name: &str, value: Option<T>) -> Vec<String> {
+    value.map_or_else(Vec::new, |v| vec![name.to_owned(), v.to_string()])
+}
+
+pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> anyhow::Result<Run> {
+    let (robot_key, operator_key) = (scratch.join("robot.key"), scratch.join("operator.key"));
+    let robot_is = Identity::load_or_create(&robot_key)?.fingerprint();
+    let operator_is = Identity::load_or_create(&operator_key)?.fingerprint();
+    let ticks = args.out.join("robot.csv");
+    let skills = args.out.join("skills");
+
+    let mut robot_args = vec!["--listen".to_owned(), "127.0.0.1:0".to_owned()];
+    robot_args.extend([
+        "--identity".to_owned(),
+        text(&robot_key),
+        "--peer".to_owned(),
+        operator_is.to_string(),
+    ]);
+    robot_args.extend(["--record".to_owned(), text(&ticks)]);
+    robot_args.extend(flag("--urdf", args.urdf.as_deref().map(text)));
+    robot_args.extend(flag("--tip", args.tip.as_ref()));
+    let mut robot = Process::start("robot", &robot_args)?;
+    let mut robot_events: Vec<Robot> = Vec::new();
+    let addr = listening(&mut robot, &mut robot_events).await?;
+
+    let clock = HostClock::new();
+    let config = RelayConfig {
+        listen: SocketAddr::from(([127, 0, 0, 1], 0)),
+        to: addr,
+        up: args.link.config(),
+        down: args.link.config(),
+        seed: args.link.link_seed,
+    };
+    let relay = Relay::bind(config, clock)
+        .await
+        .context("no port for the relay")?;
+    let via = relay.local_addr()?;
+    let (quit, quit_rx) = watch::channel(false);
+    let relaying = tokio::spawn(async move {
+        let mut passages = Vec::new();
+        relay.run(quit_rx, |passage| passages.push(passage)).await;
+        passages
+    });
+
+    let mut operator_args = vec!["--connect".to_owned(), via.to_string()];
+    operator_args.extend([
+        "--identity".to_owned(),
+        text(&operator_key),
+        "--peer".to_owned(),
+        robot_is.to_string(),
+    ]);
+    operator_args.extend([
+        "--learn".to_owned(),
+        text(&material.demos),
+        "--save".to_owned(),
+        text(&skills),
+    ]);
+    operator_args.extend(flag("--match", material.matching.as_ref()));
+    operator_args.extend(flag("--scale", args.scale));
+    operator_args.extend([
+        "--axes".to_owned(),
+        format!("{:?}", args.axes).to_lowercase(),
+    ]);
+    let name = std::fs::canonicalize(&material.demos)?;
+    let name = name
+        .file_name()
+        .map(|n| n.to_string_lossy().into_owned())
+        .unwrap_or_default();
+    if args.play {
+        operator_args.extend(["--play".to_owned(), name.clone()]);
+    } else {
+        operator_args.extend(["--replay".to_owned(), text(&material.replay)]);
+    }
+    let mut operator = Process::start("operator", &operator_args)?;
+    let mut operator_events: Vec<Operator> = Vec::new();
+    let watched = tokio::select! {
+        biased;
+        _ = tokio::signal::ctrl_c() => Err(anyhow::anyhow!("stopped by hand")),
+        end = watch_robot(&mut robot, &mut robot_events) => end,
+        done = watch_operator(&mut operator, &mut operator_events, args) => done,
+    };
+    // Whatever happened, nobody is left behind: first the hand, then the arm, then the link.
+    let left = operator.finish(&mut operator_events).await;
+    let stopped = robot.finish(&mut robot_events).await;
+    quit.send_replace(true);
+    let passages = relaying.await.context("the relay ended early")?;
+    watched?;
+    left?;
+    stopped?;
+    let why = operator_events.iter().find_map(|e| match e {
+        Operator::Done { why, .. } => Some(why.clone()),
+        _ => None,
+    });
+    match why {
+        Some(None) => {}
+        Some(Some(why)) => bail!("the run was cut short: {why}"),
+        None => bail!("the operator ended without a result"),
+    }
+    let skill = skills.join(format!("{name}.skill"));
+    Ok(Run {
+        robot: robot_events,
+        operator: operator_events,
+        passages,
+        ticks,
+        skill,
+    })
+}
+
+async fn listening(robot: &mut Process, events: &mut Vec<Robot>) -> anyhow::Result<SocketAddr> {
+    let first = timeout(Duration::from_secs(60), robot.next())
+        .await
+        .context("the robot does not start")??;
+    let Some(event) = first else {
+        bail!("the robot did not start; it says why above")
+    };
+    events.push(event);
+    match events.last() {
+        Some(Robot::Listening { addr, .. }) => Ok(*addr),
+        other => bail!("the robot begins with {other:?}"),
+    }
+}
+
+/// Ends only if the robot does, which it should not.
+async fn watch_robot(robot: &mut Process, events: &mut Vec<Robot>) -> anyhow::Result<()> {
+    while let Some(event) = robot.next().await? {
+        events.push(event);
+    }
+    bail!("the robot ended before the operator; it says why above")
+}
+
+async fn watch_operator(
+    operator: &mut Process,
+    events: &mut Vec<Operator>,
+    args: &Args,
+) -> anyhow::Result<()> {
+    let bar = ProgressBar::new(1000);
+    if let Ok(style) = ProgressStyle::with_template("{msg:28} {bar:40} {percent:>3} %") {
+        bar.set_style(style);
+    }
+    bar.set_message("learning");
+    bar.tick();
+    while let Some(event) = operator.next().await? {
+        match &event {
+            Operator::Note { text } => bar.suspend(|| eprintln!("note: {text}")),
+            Operator::Learned { .. } => bar.set_message("learned; connecting"),
+            Operator::Connected { .. } => bar.set_message("connected"),
+            Operator::Engaged { .. } if args.play => bar.set_message("playing"),
+            Operator::Engaged { .. } => bar.set_message("driving"),
+            Operator::State { state, cause, .. } if state == "Coasting" || state == "Holding" => {
+                bar.suspend(|| eprintln!("robot: {state} ({cause})"));
+            }
+            Operator::Progress { done } => bar.set_position((done * 1e3) as u64),
+            _ => {}
+        }
+        events.push(event);
+    }
+    bar.finish_and_clear();
+    Ok(())
+}

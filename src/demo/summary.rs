@@ -1,0 +1,228 @@
+//! The demo's result, for people and as the one JSON object that `docs/experiments.md` describes.
+
+use std::path::PathBuf;
+
+use anyhow::Context;
+use serde::Serialize;
+use telemime_operator::cli::Event as Operator;
+use telemime_robot::cli::Event as Robot;
+
+use super::judge::Verdict;
+use super::processes::Run;
+use super::{Args, Material};
+
+/// Bytes of a raw sample: four f32 and the headers of IP and UDP.
+const RAW_SAMPLE: u64 = 4 * 4 + 28;
+
+/// Kept stable: fields are added, not changed.
+#[derive(Debug, Serialize)]
+struct Result {
+    what: String,
+    arm: String,
+    rmse_delayed_m: f64,
+    rmse_delayed_same_arm_m: f64,
+    rmse_floor_m: f64,
+    rmse_predicted_m: f64,
+    fraction_hidden: f64,
+    lag_delayed_ms: f64,
+    lag_delayed_same_arm_ms: f64,
+    lag_floor_ms: f64,
+    lag_predicted_ms: f64,
+    scale: f64,
+    clamps: u32,
+    coasted: u32,
+    bytes_on_wire: u64,
+    bytes_raw: u64,
+    bytes_session: Session,
+    messages: u32,
+    checkpoints: u32,
+    samples: u32,
+    path_bound_m: f64,
+    path_error_m: f64,
+    path_samples: usize,
+    link_delay_ms: f64,
+    link_jitter_ms: f64,
+    link_loss: f64,
+    clock_bound_ms: Option<f64>,
+    judged_s: f64,
+    tick_mean_us: f64,
+    tick_p99_us: f64,
+    overruns: u32,
+}
+
+#[derive(Debug, Clone, Copy, Serialize)]
+struct Session {
+    operator_to_robot: u64,
+    robot_to_operator: u64,
+}
+
+pub(super) fn print(
+    args: &Args,
+    material: &Material,
+    run: &Run,
+    verdict: &Verdict,
+    figures: &[PathBuf],
+) -> anyhow::Result<()> {
+    let result = gather(args, material, run, verdict)?;
+    let mut text = table(&result);
+    for figure in figures {
+        text.push_str(&format!("figure        {}\n", figure.display()));
+    }
+    if args.json {
+        eprint!("{text}");
+        println!("{}", serde_json::to_string(&result)?);
+    } else {
+        print!("{text}");
+    }
+    Ok(())
+}
+
+/// Mean and 99th percentile of a servo tick, µs, and late ticks.
+pub(super) fn servo(run: &Run) -> (f64, f64, u32) {
+    let found = run.robot.iter().find_map(|e| match e {
+        Robot::Servo {
+            mean_ns,
+            p99_ns,
+            overruns,
+            ..
+        } => Some((
+            f64::from(*mean_ns) * 1e-3,
+            f64::from(*p99_ns) * 1e-3,
+            *overruns,
+        )),
+        _ => None,
+    });
+    found.unwrap_or_default()
+}
+
+/// The arm's name.
+pub(super) fn arm(run: &Run) -> String {
+    let name = run.robot.iter().find_map(|e| {
+        if let Robot::Listening { arm, .. } = e {
+            Some(arm)
+        } else {
+            None
+        }
+    });
+    name.cloned().unwrap_or_default()
+}
+
+fn gather(
+    args: &Args,
+    material: &Material,
+    run: &Run,
+    verdict: &Verdict,
+) -> anyhow::Result<Result> {
+    let done = run
+        .operator
+        .iter()
+        .find(|e| matches!(e, Operator::Done { .. }));
+    let Some(Operator::Done {
+        samples,
+        messages,
+        knots,
+        bytes_on_wire,
+        bytes_session_up,
+        bytes_session_down,
+        ..
+    }) = done
+    else {
+        anyhow::bail!("the operator gave no result");
+    };
+    let path_bound_m = run.operator.iter().find_map(|e| match e {
+        Operator::Mapping { path_bound_m, .. } => Some(*path_bound_m),
+        _ => None,
+    });
+    let clock_bound_ms = run.robot.iter().find_map(|e| match e {
+        Robot::Disconnected { clock_bound_s, .. } => clock_bound_s.map(|s| s * 1e3),
+        _ => None,
+    });
+    let (tick_mean_us, tick_p99_us, overruns) = servo(run);
+    Ok(Result {
+        what: material.what.clone(),
+        arm: arm(run),
+        rmse_delayed_m: verdict.delayed.rmse_m,
+        rmse_delayed_same_arm_m: verdict.delayed_arm.rmse_m,
+        rmse_floor_m: verdict.floor.rmse_m,
+        rmse_predicted_m: verdict.predicted.rmse_m,
+        fraction_hidden: verdict.fraction_hidden(),
+        lag_delayed_ms: verdict.delayed.lag_s * 1e3,
+        lag_delayed_same_arm_ms: verdict.delayed_arm.lag_s * 1e3,
+        lag_floor_ms: verdict.floor.lag_s * 1e3,
+        lag_predicted_ms: verdict.predicted.lag_s * 1e3,
+        scale: verdict.mapping.scale,
+        clamps: verdict.clamps,
+        coasted: verdict.coasted,
+        bytes_on_wire: *bytes_on_wire,
+        bytes_raw: RAW_SAMPLE * u64::from(*samples),
+        bytes_session: Session {
+            operator_to_robot: *bytes_session_up,
+            robot_to_operator: *bytes_session_down,
+        },
+        messages: *messages,
+        checkpoints: *knots,
+        samples: *samples,
+        path_bound_m: path_bound_m.context("the operator never said how it maps")?,
+        path_error_m: verdict.path_error_m,
+        path_samples: verdict.path_samples,
+        link_delay_ms: args.link.delay * 1e3,
+        link_jitter_ms: args.link.jitter * 1e3,
+        link_loss: args.link.loss,
+        clock_bound_ms,
+        judged_s: verdict.grid_s.len() as f64 * 1e-3,
+        tick_mean_us,
+        tick_p99_us,
+        overruns,
+    })
+}
+
+fn table(r: &Result) -> String {
+    let mm = |m: f64| format!("{:6.1} mm", m * 1e3);
+    let ms = |ms: f64| format!("{ms:5.0} ms");
+    let clock = r.clock_bound_ms.map_or_else(String::new, |ms| {
+        format!(", session clock known to ±{ms:.0} ms")
+    });
+    format!(
+        "\n{}\n{} at scale {:.3}; {:.0} ± {:.0} ms and {:.1} % loss each way; judged over {:.1} s\n\n\
+         hand against tip, in hand metres      RMS error    lag\n\
+         as sent, delayed, ideal tip          {}   {}\n\
+         as sent, delayed, through the arm    {}   {}\n\
+         predicted                            {}   {}   {:.0} % of the delay's cost hidden\n\
+         floor: perfect knowledge, same arm   {}   {}\n\n\
+         on the wire   {} B of motion in {} messages; raw streaming {} B; ratio {:.2}\n\
+         path          {} checkpoints for {} samples; within {} of the hand ({} promised)\n\
+         session       {} B up, {} B down besides (keys, model, acknowledgements, telemetry){clock}\n\
+         servo         {:.1} µs a tick, {:.1} µs p99, {} late; a limit acted on {} ticks; coasted {} times\n",
+        r.what,
+        r.arm,
+        r.scale,
+        r.link_delay_ms,
+        r.link_jitter_ms,
+        r.link_loss * 1e2,
+        r.judged_s,
+        mm(r.rmse_delayed_m),
+        ms(r.lag_delayed_ms),
+        mm(r.rmse_delayed_same_arm_m),
+        ms(r.lag_delayed_same_arm_ms),
+        mm(r.rmse_predicted_m),
+        ms(r.lag_predicted_ms),
+        r.fraction_hidden * 1e2,
+        mm(r.rmse_floor_m),
+        ms(r.lag_floor_ms),
+        r.bytes_on_wire,
+        r.messages,
+        r.bytes_raw,
+        r.bytes_on_wire as f64 / r.bytes_raw as f64,
+        r.checkpoints,
+        r.samples,
+        mm(r.path_error_m).trim(),
+        mm(r.path_bound_m).trim(),
+        r.bytes_session.operator_to_robot,
+        r.bytes_session.robot_to_operator,
+        r.tick_mean_us,
+        r.tick_p99_us,
+        r.overruns,
+        r.clamps,
+        r.coasted,
+    )
+}

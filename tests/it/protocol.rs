@@ -1,0 +1,468 @@
+//! The examples in docs/protocol.md are true: bytes are encoded, numbers computed, by the code.
+
+use std::collections::BTreeMap;
+use std::fmt::{Debug, Display};
+use std::path::Path;
+
+use nalgebra::{SMatrix, SVector, Vector3};
+use telemime_endpoint::Mono;
+use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid, PathKnot};
+use telemime_protocol::checkpoint::{Checkpoint, Grid, Plan};
+use telemime_protocol::predict::{
+    BLOCK, Calibration, FEATURES, Forecast, MAX_KNOTS, Model, Regression, Standardisation, TARGETS,
+};
+use telemime_protocol::skill::{Gmm, Provenance, Skill, Source, Stats};
+use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::codec;
+use telemime_protocol::wire::frame::{self, Frame};
+use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
+use telemime_protocol::wire::knots;
+use telemime_protocol::wire::state::WireState;
+use telemime_protocol::wire::v1::{
+    Cause, Drive, Engage, Info, Message, Motion, OperatorControl, OperatorDatagram, Refusal,
+    RobotControl, RobotDatagram, RobotState, Telemetry, WireParams, model_tag,
+};
+use telemime_robot::rig::{Rig, RigOptions};
+use telemime_robot::servo;
+use telemime_robot::session::{Output, Session, SessionConfig, TickTiming};
+
+const STATE: WireState = WireState {
+    t_us: 3_000_000,
+    x: [4_000, -2_000, 25_000],
+    memory_exponent: 5,
+    memory: [[10, -4, 0], [24, -9, 1], [50, -20, 2], [80, -30, 5]],
+};
+
+const PARAMS: WireParams = WireParams {
+    gain: 255,
+    trust: 230,
+    cv_damping: 128,
+};
+
+const KNOTS: [PathKnot; 2] = [
+    PathKnot {
+        tick: 240_000,
+        x: [70, -40, 500],
+        v: [3, -4, 0],
+        start: true,
+    },
+    PathKnot {
+        tick: 270_000,
+        x: [80, -41, 502],
+        v: [0, 2, 0],
+        start: false,
+    },
+];
+
+fn grid() -> PathGrid {
+    PathGrid::for_bound(0.02).unwrap()
+}
+
+fn motion(checksum: Option<u32>) -> Motion {
+    Motion {
+        epoch: 7,
+        engagement: 1,
+        seq: 42,
+        lease_ms: 650,
+        model: 0,
+        params: PARAMS,
+        checksum,
+        state: STATE,
+        first_knot: 3,
+        knots: knots::pack(&STATE, grid(), &KNOTS).unwrap(),
+    }
+}
+
+fn plan() -> Plan<3> {
+    let point = |t_s, x: [f64; 3]| Checkpoint {
+        t_s,
+        x: SVector::from(x),
+    };
+    let points = [
+        point(0.0, [0.1, 0.0, -0.3]),
+        point(0.25, [0.15, 0.05, -0.3]),
+        point(0.4, [0.2, 0.01, 0.7]),
+    ];
+    Plan::quantise(Grid::for_bound(0.004).unwrap(), &points).unwrap()
+}
+
+/// Two components, three knots; every number is a short binary fraction, so that it survives f32.
+fn skill() -> Skill {
+    let component = |weight, first_mean, target: f64, gain: f64| {
+        let mut mean = SVector::<f64, FEATURES>::zeros();
+        mean[0] = first_mean;
+        let mut target_m = [0.0; TARGETS];
+        let mut gains = [[0.0; TARGETS]; FEATURES];
+        for knot in 0..3 {
+            target_m[3 * knot] = target * (knot + 1) as f64;
+            gains[3][3 * knot] = gain * (knot + 1) as f64;
+        }
+        Regression {
+            weight,
+            mean,
+            factor: SMatrix::identity(),
+            target: target_m,
+            gain: gains,
+            residual: [[0.0625, 0.0, 0.0, 0.0625, 0.0, 0.0625]; MAX_KNOTS],
+        }
+    };
+    const { assert!(BLOCK == 6) };
+    let mut calibration = Calibration::UNTRIED;
+    calibration.covariance = [2.0; MAX_KNOTS];
+    calibration.straight_m2 = [0.25; MAX_KNOTS];
+    calibration.novelty90 = 16.0;
+    let model = Model::new(
+        3,
+        Standardisation {
+            mean: SVector::zeros(),
+            scale: SVector::repeat(0.5),
+        },
+        vec![
+            component(0.75, 0.0, 0.125, 0.25),
+            component(0.25, 1.0, -0.0625, 0.5),
+        ],
+        calibration,
+    )
+    .unwrap();
+    let motion = Gmm::new([(
+        1.0,
+        SVector::from([1.0, 0.5, 0.0, 2.0]),
+        SMatrix::identity(),
+    )])
+    .unwrap();
+    let stats = Stats {
+        speed95_m_s: 4.0,
+        acceleration95_m_s2: 32.0,
+        reach_m: 0.5,
+        min: Vector3::new(0.0, -0.5, 1.5),
+        max: Vector3::new(0.5, 0.5, 2.5),
+    };
+    let provenance = Provenance {
+        producer: "example".to_owned(),
+        seed: 0,
+        sources: vec![Source {
+            name: "one".to_owned(),
+            sha256: [0xab; 32],
+        }],
+    };
+    Skill::new("wave".to_owned(), &motion, 2.0, &model, stats, provenance).unwrap()
+}
+
+fn info() -> Info {
+    Info {
+        name: "mime7".to_owned(),
+        joints: 7,
+        speed_m_s: 1.5,
+        accel_m_s2: 13.0,
+        radius_m: 0.25,
+        lag_s: 0.0625,
+        model: None,
+        state: RobotState::Idle,
+    }
+}
+
+fn telemetry() -> Telemetry {
+    Telemetry {
+        epoch: 7,
+        seq: 300,
+        state: RobotState::Engaged,
+        engagement: 1,
+        t_us: 3_100_000,
+        clock_uncertainty_us: 100_500,
+        age_ms: 180,
+        delay_ms: 101,
+        path_frontier: 5,
+        received: 40,
+        newest_seq: 42,
+        dropped: 0,
+        clamps: 3,
+        tick_mean_ns: 12_000,
+        tick_p99_ns: 30_000,
+        overruns: 0,
+        tip_m: [0.5, 0.0, 0.25],
+        q: vec![0.0, 1.0],
+    }
+}
+
+/// Bytes that are a message, and nothing but that message.
+fn message<M: Message + PartialEq + Debug>(message: &M) -> Vec<u8> {
+    let bytes = message.encode();
+    assert_eq!(M::decode(&bytes).as_ref(), Ok(message));
+    bytes
+}
+
+fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
+    let stop = message(&OperatorControl::EmergencyStop);
+    let checksum = Forecast::constant_velocity(&STATE.dequantise(), &PARAMS.dequantise());
+    let rotation = [0.5, -0.5, 0.5, -0.5];
+    let engage = |drive| {
+        OperatorControl::Engage(Engage {
+            engagement: 1,
+            drive,
+            scale: 0.125,
+            rotation,
+            path_bound_um: 20_000,
+            lease_ms: 650,
+        })
+    };
+    let mirror = Drive::Mirror {
+        state: STATE,
+        model: 0,
+        params: PARAMS,
+    };
+    let hello = Hello {
+        min: 1,
+        max: 1,
+        features: 0,
+    };
+    let ack = Answer::Ack {
+        version: 1,
+        features: 0,
+        epoch: 7,
+    };
+    let reject = Answer::Reject {
+        code: RejectCode::Busy,
+        text: "another operator has authority".to_owned(),
+    };
+    BTreeMap::from([
+        ("u 0", codec::encode(&0u32)),
+        ("u 250", codec::encode(&250u32)),
+        ("u 251", codec::encode(&251u32)),
+        ("u 65536", codec::encode(&65_536u64)),
+        ("u 4294967296", codec::encode(&4_294_967_296u64)),
+        ("i -1", codec::encode(&-1i64)),
+        ("i 126", codec::encode(&126i32)),
+        ("i -126", codec::encode(&-126i32)),
+        ("hello", hello.encode()),
+        ("hello-ack", ack.encode()),
+        ("reject", reject.encode()),
+        ("frame", frame::encode(&stop, false)),
+        ("engage-mirror", message(&engage(mirror))),
+        ("engage-play", message(&engage(Drive::Play { plan: 1 }))),
+        ("info", message(&RobotControl::Info(info()))),
+        (
+            "engaged",
+            message(&RobotControl::Engaged {
+                engagement: 1,
+                t_us: 3_050_000,
+                hand_m: [0.5, -0.25, 2.5],
+                tip_m: [0.5, 0.0, 0.25],
+            }),
+        ),
+        (
+            "refused",
+            message(&RobotControl::Refused {
+                reason: Refusal::ClockUnknown,
+            }),
+        ),
+        (
+            "state",
+            message(&RobotControl::State {
+                state: RobotState::Holding,
+                cause: Cause::LeaseExpired,
+            }),
+        ),
+        (
+            "motion",
+            message(&OperatorDatagram::Motion(motion(Some(checksum.checksum())))),
+        ),
+        (
+            "go",
+            message(&OperatorDatagram::Go {
+                epoch: 7,
+                engagement: 2,
+                seq: 43,
+                t_us: 3_200_000,
+                lease_ms: 650,
+            }),
+        ),
+        (
+            "pong",
+            message(&OperatorDatagram::Pong {
+                epoch: 7,
+                t1_us: 90_000_000,
+                t2_us: 3_000_000,
+                t3_us: 3_000_000,
+            }),
+        ),
+        ("stop", message(&OperatorDatagram::Stop { epoch: 7 })),
+        (
+            "ping",
+            message(&RobotDatagram::Ping {
+                epoch: 7,
+                t1_us: 90_000_000,
+            }),
+        ),
+        ("telemetry", message(&RobotDatagram::Telemetry(telemetry()))),
+        ("plan", codec::encode(&plan())),
+    ])
+}
+
+fn values() -> BTreeMap<String, String> {
+    let mut values = BTreeMap::new();
+    let mut say = |name: &str, value: String| {
+        assert!(values.insert(name.to_owned(), value).is_none(), "{name}");
+    };
+    let vector = |v: &Vector3<f64>| format!("{:.9} {:.9} {:.9}", v.x, v.y, v.z);
+
+    let state = STATE.dequantise();
+    let params = PARAMS.dequantise();
+    (0..4).for_each(|i| say(&format!("m{}", i + 1), vector(&state.memory[i])));
+    let (velocity, acceleration) = state.motion();
+    say("v", vector(&velocity));
+    say("a", vector(&acceleration));
+    let straight = Forecast::constant_velocity(&state, &params);
+    say("cv(0.1)", vector(&straight.at(0.1).position));
+    say("cv sigma(0.1)", format!("{:.9}", straight.at(0.1).sigma_m));
+    say("cv checksum", format!("{:08x}", straight.checksum()));
+
+    let mut advanced = state;
+    assert!(advanced.advance(Stamp(3_033_000_000), Vector3::new(0.41, -0.2, 2.5)));
+    (0..4).for_each(|i| say(&format!("next m{}", i + 1), vector(&advanced.memory[i])));
+
+    let skill = skill();
+    let forecast = skill.predictor().forecast(&state, &params);
+    let posterior = skill.predictor().posterior(&state);
+    say("skill bytes", skill.to_bytes().len().to_string());
+    say("skill id", skill.id().to_string());
+    say("skill tag", model_tag(&skill.id().0).to_string());
+    say("novelty", format!("{:.9}", posterior.novelty));
+    say("mixture(3)", vector(&posterior.displacement[2]));
+    say("weight", format!("{:.9}", forecast.weight));
+    say("blend(0.1)", vector(&forecast.at(0.1).position));
+    say(
+        "blend sigma(0.1)",
+        format!("{:.9}", forecast.at(0.1).sigma_m),
+    );
+    say("blend checksum", format!("{:08x}", forecast.checksum()));
+
+    let mut path = PathDecoder::new(grid(), 8);
+    knots::unpack(&STATE, grid(), &motion(None).knots)
+        .zip(KNOTS)
+        .for_each(|(found, sent)| {
+            assert_eq!(found, sent);
+            path.append(&found).unwrap();
+        });
+    let jet = path.eval(Stamp(2_500_000_000)).unwrap();
+    say("path x(2.5)", vector(&jet.x));
+    say("path v(2.5)", vector(&jet.v));
+
+    let jet = plan().spline().unwrap().eval(0.1).unwrap();
+    say("plan x(0.1)", vector(&jet.x));
+    say("plan v(0.1)", vector(&jet.v));
+    say("plan a(0.1)", vector(&jet.a));
+    values
+}
+
+fn document() -> String {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/protocol.md");
+    std::fs::read_to_string(path).unwrap()
+}
+
+/// The content of every fenced block that begins with "```kind", with what follows the kind.
+fn blocks<'a>(text: &'a str, kind: &str) -> Vec<(&'a str, &'a str)> {
+    let fence = format!("```{kind} ");
+    let mut found = Vec::new();
+    let mut rest = text;
+    while let Some(at) = rest.find(&fence) {
+        let (title, after) = rest[at + fence.len()..].split_once('\n').unwrap();
+        let (body, after) = after.split_once("```").unwrap();
+        found.push((title.trim(), body));
+        rest = after;
+    }
+    found
+}
+
+fn hex(bytes: &[u8]) -> String {
+    let pairs: Vec<_> = bytes.iter().map(|b| format!("{b:02x}")).collect();
+    pairs.join(" ")
+}
+
+/// Fails with all that the document should say instead.
+fn same<K: Ord + Display>(written: &BTreeMap<K, String>, expected: &BTreeMap<K, String>) {
+    let wrong = expected.iter().filter(|(k, v)| written.get(k) != Some(v));
+    let wrong: String = wrong.map(|(k, v)| format!("{k} = {v}\n")).collect();
+    assert!(wrong.is_empty(), "docs/protocol.md should say\n{wrong}");
+    let stray = written.keys().filter(|k| !expected.contains_key(k));
+    let stray: String = stray.map(|k| format!("{k}\n")).collect();
+    assert!(stray.is_empty(), "no code stands behind\n{stray}");
+}
+
+#[test]
+fn the_bytes_in_the_specification_are_those_of_the_code() {
+    let text = document();
+    let mut written = BTreeMap::new();
+    for (title, body) in blocks(&text, "hex") {
+        for line in body.lines() {
+            let line = line.split('#').next().unwrap_or_default();
+            // One block may hold several short encodings, each line under its own name.
+            let (name, digits) = line.split_once(" = ").unwrap_or((title, line));
+            let bytes = digits
+                .split_whitespace()
+                .map(|pair| u8::from_str_radix(pair, 16).unwrap());
+            let all: &mut Vec<u8> = written.entry(name.trim()).or_default();
+            all.extend(bytes);
+        }
+    }
+    let written: BTreeMap<_, _> = written.iter().map(|(n, b)| (*n, hex(b))).collect();
+    let expected: BTreeMap<_, _> = bytes().iter().map(|(n, b)| (*n, hex(b))).collect();
+    same(&written, &expected);
+}
+
+#[test]
+fn the_numbers_in_the_specification_are_those_of_the_code() {
+    let text = document();
+    let written: BTreeMap<_, _> = blocks(&text, "values")
+        .iter()
+        .flat_map(|(_, body)| body.lines())
+        .filter_map(|line| line.split_once(" = "))
+        .map(|(name, value)| (name.trim().to_owned(), value.trim().to_owned()))
+        .collect();
+    same(&written, &values());
+}
+
+#[test]
+fn a_plan_that_does_not_begin_at_zero_is_refused() {
+    let rig = Rig::load(&RigOptions::default()).unwrap();
+    let (rings, _handle) = servo::rings();
+    let report = rig.servo(rings).tick(Mono(0));
+    let mut session = Session::new(SessionConfig::default(), rig.info(), 1, None, Mono(0));
+    session.handle_report(&report, TickTiming::default());
+    let point = |t_s| Checkpoint {
+        t_s,
+        x: SVector::from([0.0, 0.0, t_s]),
+    };
+    let late = Plan::quantise(Grid::for_bound(0.004).unwrap(), &[point(0.5), point(1.0)]).unwrap();
+    let mut ask = |message: OperatorControl| {
+        let frame = Frame {
+            ignorable: false,
+            payload: message.encode(),
+        };
+        session.handle_control(Mono(1), &frame).unwrap();
+        let mut said = Vec::new();
+        while let Some(output) = session.poll_output() {
+            if let Output::Control(bytes) = output {
+                said.push(RobotControl::decode(&bytes).unwrap());
+            }
+        }
+        said
+    };
+    ask(OperatorControl::Plan {
+        id: 1,
+        bytes: codec::encode(&late),
+    });
+    let said = ask(OperatorControl::Engage(Engage {
+        engagement: 1,
+        drive: Drive::Play { plan: 1 },
+        scale: 0.1,
+        rotation: [1.0, 0.0, 0.0, 0.0],
+        path_bound_um: 1000,
+        lease_ms: 650,
+    }));
+    assert_eq!(
+        said,
+        [RobotControl::Refused {
+            reason: Refusal::BadPlan
+        }]
+    );
+}
