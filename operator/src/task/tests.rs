@@ -90,6 +90,7 @@ fn after_a_hold_or_a_stop_nothing_is_asked_again() {
         let (mut task, mut session) = (replay(), ready());
         let mut now = at(0);
         task.advise(now, &mut session);
+        assert_eq!(task.phase, Phase::Asked);
         let engaged = Event::Engaged {
             engagement: 1,
             hand_m: [0.0; 3],
