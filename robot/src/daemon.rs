@@ -26,7 +26,7 @@ const DRAIN: Duration = Duration::from_millis(4);
 const CLOSED: u32 = 0;
 const MALFORMED: u32 = 1;
 const REJECTED: u32 = 2;
-const MALFORMED_GREETING: u32 = 3;
+const BAD_GREETING: u32 = 3;
 const FAULT: u32 = 4;
 
 /// What is still to be said when a session ends gets this long.
@@ -254,16 +254,7 @@ impl Daemon {
         let peer = connection.remote_address();
         if let Some((code, text)) = refusal {
             let why = format!("{peer}: {text}");
-            tokio::spawn(async move {
-                // The peer may be gone already; there is nobody else to tell.
-                let _ = tokio::time::timeout(LAST_WORDS, async {
-                    let _ = control.write(&Answer::Reject { code, text }.encode()).await;
-                    let _ = control.send.finish();
-                    let _ = control.send.stopped().await;
-                })
-                .await;
-                connection.close(VarInt::from_u32(REJECTED), b"rejected");
-            });
+            tokio::spawn(turn_away(connection, control, code, text));
             return Some(why);
         }
         *epoch += 1;
@@ -485,17 +476,21 @@ async fn greet(
         }
         Err(e) => {
             let text = e.to_string();
-            let _ = control
-                .write(
-                    &Answer::Reject {
-                        code: RejectCode::Malformed,
-                        text: text.clone(),
-                    }
-                    .encode(),
-                )
-                .await;
-            connection.close(VarInt::from_u32(MALFORMED_GREETING), b"malformed greeting");
+            turn_away(connection, control, RejectCode::Malformed, text.clone()).await;
             refused(text);
         }
     }
+}
+
+/// Says why there is no session, and closes once that has been read.
+async fn turn_away(connection: Connection, mut control: Control, code: RejectCode, text: String) {
+    let close = match code {
+        RejectCode::Malformed => BAD_GREETING,
+        _ => REJECTED,
+    };
+    // The peer may be gone already; there is nobody else to tell.
+    let _ = control.write(&Answer::Reject { code, text }.encode()).await;
+    let _ = control.send.finish();
+    let _ = tokio::time::timeout(Duration::from_secs(2), control.send.stopped()).await;
+    connection.close(VarInt::from_u32(close), b"rejected");
 }

@@ -99,11 +99,13 @@ fn entered(pair: &Pair, since: Mono, state: RobotState) -> f64 {
 }
 
 fn events(notices: &[Notice]) -> Vec<&Event> {
-    let event = |n| match n {
-        &Notice::Event(_, ref event) => Some(event),
-        _ => None,
-    };
-    notices.iter().filter_map(event).collect()
+    let mut events = Vec::new();
+    for notice in notices {
+        if let Notice::Event(_, event) = notice {
+            events.push(event);
+        }
+    }
+    events
 }
 
 #[test]

@@ -390,11 +390,14 @@ impl Session {
             return;
         };
         self.activity = Activity::Mirror(Box::new(mirror));
-        self.request(now, Drive::Mirror {
-            state,
-            model,
-            params,
-        });
+        self.request(
+            now,
+            Drive::Mirror {
+                state,
+                model,
+                params,
+            },
+        );
         self.last_sent = now;
     }
 
