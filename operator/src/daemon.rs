@@ -1,6 +1,8 @@
 //! The operator's shell: dials, redials, feeds the session samples and moves its bytes.
 
+use std::future::Future;
 use std::net::SocketAddr;
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -109,6 +111,8 @@ pub enum Notice {
     Event(Stamp, Event),
     /// How far the task has got, in [0, 1]; a few times a second.
     Progress(f64),
+    /// What became of something the person at the terminal said.
+    Note(&'static str),
     /// The scale the next engagement uses, and ε_path, m.
     Mapping {
         /// Tip metres per hand metre.
@@ -131,6 +135,31 @@ struct Link {
 struct Console<'a> {
     quit: &'a mut watch::Receiver<bool>,
     words: &'a mut mpsc::UnboundedReceiver<Word>,
+    notices: &'a mpsc::UnboundedSender<Notice>,
+}
+
+impl Console<'_> {
+    /// Does `work` while nobody can be told: a stop is kept in `stop`, a reset is not.
+    async fn beside<T>(&mut self, stop: &mut bool, work: impl Future<Output = T>) -> T {
+        let mut work = pin!(work);
+        loop {
+            tokio::select! {
+                biased;
+                Some(word) = self.words.recv() => self.note(match word {
+                    Word::Stop => {
+                        *stop = true;
+                        "there is no link: the emergency stop is the first thing the robot will hear"
+                    }
+                    Word::Reset => "there is no link: the reset is discarded",
+                }),
+                done = &mut work => return done,
+            }
+        }
+    }
+
+    fn note(&self, text: &'static str) {
+        let _ = self.notices.send(Notice::Note(text));
+    }
 }
 
 enum DialError {
@@ -164,23 +193,31 @@ impl Daemon {
             sessions: 0,
         };
         let mut marks = Marks::default();
+        // Demanded, and not confirmed by the robot: outlives the session it was demanded in.
+        let mut stop = false;
         loop {
+            let mut hung_up = quit.clone();
+            let mut console = Console {
+                quit: &mut quit,
+                words: &mut words,
+                notices,
+            };
             let link = tokio::select! {
                 biased;
-                () = told(&mut quit) => break,
-                link = self.dial(summary.sessions == 0, task, notices) => link?,
+                () = told(&mut hung_up) => break,
+                link = self.dial(summary.sessions == 0, task, &mut console, &mut stop) => link?,
             };
             let Some(link) = link else { break };
             summary.sessions += 1;
             let _ = notices.send(Notice::Connected { epoch: link.epoch });
             let mut session = Session::new(self.config, self.skill.clone(), link.epoch);
-            let console = Console {
-                quit: &mut quit,
-                words: &mut words,
-            };
+            if stop {
+                session.stop(self.now());
+            }
             let end = self
-                .drive(&mut session, link, task, console, notices, &mut marks)
+                .drive(&mut session, link, task, console, &mut marks)
                 .await;
+            stop = session.stop_is_unconfirmed();
             summary.counters.add(session.counters());
             match end {
                 End::Finished | End::Quit => break,
@@ -192,6 +229,12 @@ impl Daemon {
         }
         self.endpoint.wait_idle().await;
         summary.outcome = task.outcome(*quit.borrow());
+        if stop {
+            summary.outcome = Outcome::Interrupted(
+                "the robot never confirmed the emergency stop; what stops its arm then is its lease"
+                    .into(),
+            );
+        }
         summary.total = self.meter.counts();
         summary.engaged = marks.span(summary.total);
         Ok(summary)
@@ -205,17 +248,18 @@ impl Daemon {
         self.clock.instant(Mono(at.0.saturating_add(self.epoch.0)))
     }
 
-    /// Dials until there is a session; `None` once the task is over anyway.
+    /// Dials until there is a session; `None` once the task is over anyway and no `stop` has to be delivered.
     async fn dial(
         &self,
         first: bool,
         task: &Task,
-        notices: &mpsc::UnboundedSender<Notice>,
+        console: &mut Console<'_>,
+        stop: &mut bool,
     ) -> Result<Option<Link>, DaemonError> {
         let begun = self.now();
         let mut attempt = FIRST_ATTEMPT;
         loop {
-            let dialled = timeout(attempt, self.connect()).await;
+            let dialled = console.beside(stop, timeout(attempt, self.connect())).await;
             attempt = (attempt * 2).min(LONGEST_ATTEMPT);
             let why = match dialled {
                 Ok(Ok(link)) => return Ok(Some(link)),
@@ -240,11 +284,12 @@ impl Daemon {
                     why,
                 });
             }
-            if task.is_over(self.now()) {
+            if task.is_over(self.now()) && !*stop {
                 return Ok(None);
             }
-            let _ = notices.send(Notice::Dialling { why });
-            sleep_until(self.instant(self.now().offset_by_secs(REDIAL_S))).await;
+            let _ = console.notices.send(Notice::Dialling { why });
+            let again = self.instant(self.now().offset_by_secs(REDIAL_S));
+            console.beside(stop, sleep_until(again)).await;
         }
     }
 
@@ -292,10 +337,9 @@ impl Daemon {
         mut link: Link,
         task: &mut Task,
         console: Console<'_>,
-        notices: &mpsc::UnboundedSender<Notice>,
         marks: &mut Marks,
     ) -> End {
-        let Console { quit, words } = console;
+        let notices = console.notices;
         loop {
             if let Err(e) = self.flush(session, &mut link).await {
                 return End::Lost(e.to_string());
@@ -321,7 +365,9 @@ impl Daemon {
                 task.on_event(now, &event);
                 let _ = notices.send(Notice::Event(now, event));
             }
-            if task.advise(now, session) == Advice::Finished {
+            let advice = task.advise(now, session);
+            // Whoever says stop is not left before the robot says it has.
+            if advice == Advice::Finished && !session.stop_is_unconfirmed() {
                 marks.released = Some(self.meter.counts());
                 return self.leave(session, link).await;
             }
@@ -342,13 +388,14 @@ impl Daemon {
             let due = due.into_iter().flatten().min();
             tokio::select! {
                 biased;
-                () = told(quit) => {
+                () = told(console.quit) => {
                     let _ = self.leave(session, link).await;
                     return End::Quit;
                 }
-                Some(word) = words.recv() => match word {
+                Some(word) = console.words.recv() => match word {
                     Word::Stop => session.stop(self.now()),
-                    Word::Reset => session.reset(),
+                    Word::Reset if session.reset() => {}
+                    Word::Reset => console.note("the reset is discarded: the robot has not confirmed the stop yet"),
                 },
                 frame = link.frames.recv() => match frame {
                     Some(Ok(frame)) => {

@@ -227,6 +227,9 @@ impl Task {
 
     /// When [`Task::advise`] has something to do next.
     pub fn poll_timeout(&self) -> Option<Stamp> {
+        if self.phase == Phase::Over {
+            return None;
+        }
         // A replay asks with its next sample; only a plan is asked for by the clock.
         let retry = match (&self.work, self.phase) {
             (Work::Play { .. }, Phase::Waiting(at)) => at,

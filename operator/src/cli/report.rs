@@ -290,6 +290,7 @@ pub(super) async fn listen_to(
                 bar.set_position((done * 1e3) as u64);
                 Event::Progress { done }
             }
+            Notice::Note(text) => Event::Note { text: text.into() },
             Notice::Event(at, event) => match event {
                 session::Event::Ready => continue,
                 session::Event::Engaged { engagement, .. } => Event::Engaged {

@@ -372,8 +372,11 @@ impl Session {
         }
     }
 
-    /// Asks the robot to follow the hand; refused here if no sample has been taken yet.
+    /// Asks the robot to follow the hand; refused here if no sample has been taken yet, or a stop is under way.
     pub fn engage(&mut self, now: Stamp) {
+        if self.refuses() {
+            return;
+        }
         let Some(hand) = self.hand else {
             self.events
                 .push_back(Event::Refused(Refusal::StaleReference));
@@ -403,6 +406,9 @@ impl Session {
 
     /// Sends a motion and plays it as soon as the robot has it.
     pub fn play(&mut self, plan: &Plan<3>) {
+        if self.refuses() {
+            return;
+        }
         self.plans += 1;
         self.activity = Activity::Play {
             plan: self.plans,
@@ -431,11 +437,20 @@ impl Session {
         self.next_stop = Some(now);
     }
 
-    /// Leaves the latched stop.
-    pub fn reset(&mut self) {
-        self.next_stop = None;
+    /// Whether a stop was demanded that the robot has not confirmed.
+    pub fn stop_is_unconfirmed(&self) -> bool {
+        self.next_stop.is_some()
+    }
+
+    /// Leaves the latched stop; false if there is one that the robot has not confirmed: nobody knows yet what
+    /// would be left.
+    pub fn reset(&mut self) -> bool {
+        if self.stop_is_unconfirmed() {
+            return false;
+        }
         let changes = self.changes;
         self.control(&OperatorControl::Reset { changes });
+        true
     }
 
     /// Ends the session.
@@ -568,6 +583,14 @@ impl Session {
             lease_ms: (self.config.lease_s * 1e3) as u16,
         };
         self.control(&OperatorControl::Engage(engage));
+    }
+
+    fn refuses(&mut self) -> bool {
+        let stopping = self.stop_is_unconfirmed();
+        if stopping {
+            self.events.push_back(Event::Refused(Refusal::Stopped));
+        }
+        stopping
     }
 
     fn control(&mut self, message: &OperatorControl) {

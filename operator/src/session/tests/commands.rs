@@ -137,13 +137,20 @@ fn a_stop_is_repeated_until_the_robot_has_stopped() {
     bench.forget();
     bench.idle(20);
     assert_eq!(bench.datagrams.len(), 2, "no other state ends it");
+    assert!(!bench.session.reset(), "there is nothing to leave yet");
+    bench.session.engage(bench.now);
+    bench.session.play(&plan());
+    bench.drain();
+    assert!(bench.control.is_empty());
+    assert_eq!(bench.events, vec![Event::Refused(Refusal::Stopped); 2]);
+    assert!(bench.session.stop_is_unconfirmed());
     bench.hears(&state(RobotState::Stopped, Cause::OperatorStop));
     bench.forget();
     bench.idle(1000);
     bench.sample(home());
     assert!(bench.datagrams.is_empty());
     assert_eq!(bench.session.poll_timeout(), None);
-    bench.session.reset();
+    assert!(bench.session.reset());
     bench.drain();
     assert_eq!(
         bench.control,
