@@ -18,8 +18,8 @@ use telemime_protocol::skill::{Skill, Stats};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::v1::{
-    Cause, Drive, Engage, Info, Message, OperatorControl, OperatorDatagram, Refusal, RobotControl,
-    RobotDatagram, RobotState, Telemetry,
+    Cause, Drive, Engage, Info, Message, OperatorControl, OperatorDatagram, PathTail, Refusal,
+    RobotControl, RobotDatagram, RobotState, Telemetry,
 };
 use telemime_protocol::wire::{DecodeError, codec};
 
@@ -363,12 +363,16 @@ impl Session {
         self.counters.samples += 1;
         self.counters.knots +=
             u32::from(mirror.take(&previous, *hand, skill, self.delay_s + lag_s));
+        let backlog = mirror.backlog();
         let arrival = now.offset_by_secs(self.delay_s + lag_s);
         let silent_s = now.secs_since(self.last_sent);
         if mirror.future_changed(arrival, self.config.future_bound)
             || silent_s >= self.config.max_silence_s
         {
             self.speak(now);
+        }
+        if let Some(tail) = backlog {
+            self.path(tail);
         }
     }
 
@@ -420,8 +424,16 @@ impl Session {
         });
     }
 
-    /// Lets go of the clutch.
+    /// Lets go of the clutch, and sees to it that the robot holds the path up to the newest sample.
     pub fn release(&mut self) {
+        if let Activity::Mirror(mirror) = &mut self.activity {
+            self.counters.knots += u32::from(mirror.close());
+            while let Activity::Mirror(mirror) = &mut self.activity
+                && let Some(tail) = mirror.tail()
+            {
+                self.path(tail);
+            }
+        }
         if !matches!(self.activity, Activity::Nothing) {
             self.control(&OperatorControl::Release {
                 engagement: self.engagement,
@@ -591,6 +603,11 @@ impl Session {
             self.events.push_back(Event::Refused(Refusal::Stopped));
         }
         stopping
+    }
+
+    fn path(&mut self, tail: PathTail) {
+        let engagement = self.engagement;
+        self.control(&OperatorControl::Path(PathTail { engagement, ..tail }));
     }
 
     fn control(&mut self, message: &OperatorControl) {

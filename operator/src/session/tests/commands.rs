@@ -201,30 +201,22 @@ fn a_plan_is_engaged_once_stored_and_kept_going() {
 
 #[test]
 fn release_and_goodbye_name_the_engagement_once() {
+    let farewell = [
+        OperatorControl::Release { engagement: 1 },
+        OperatorControl::Goodbye,
+    ];
     let mut bench = Bench::engaged(SessionConfig::default(), None);
     bench.session.release();
     bench.session.release();
     bench.session.goodbye();
     bench.sample(home() + Vector3::x());
-    assert_eq!(
-        bench.control,
-        [
-            OperatorControl::Release { engagement: 1 },
-            OperatorControl::Goodbye
-        ]
-    );
+    assert_eq!(bench.control, farewell);
     assert!(bench.datagrams.is_empty());
 
     let mut bench = Bench::engaged(SessionConfig::default(), None);
     bench.session.goodbye();
     bench.drain();
-    assert_eq!(
-        bench.control,
-        [
-            OperatorControl::Release { engagement: 1 },
-            OperatorControl::Goodbye
-        ]
-    );
+    assert_eq!(bench.control, farewell);
 }
 
 #[test]
