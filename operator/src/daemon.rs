@@ -83,7 +83,7 @@ pub struct Summary {
     pub counters: Counters,
     /// Traffic from first packet to last.
     pub total: Counts,
-    /// Traffic from engage to release.
+    /// Traffic from the request that was granted until the release had been sent.
     pub engaged: Counts,
     /// Sessions begun.
     pub sessions: u32,
@@ -211,6 +211,7 @@ impl Daemon {
             summary.sessions += 1;
             let _ = notices.send(Notice::Connected { epoch: link.epoch });
             let mut session = Session::new(self.config, self.skill.clone(), link.epoch);
+            marks.requests = 0;
             if stop {
                 session.stop(self.now());
             }
@@ -341,7 +342,7 @@ impl Daemon {
     ) -> End {
         let notices = console.notices;
         loop {
-            if let Err(e) = self.flush(session, &mut link).await {
+            if let Err(e) = self.flush(session, &mut link, marks).await {
                 return End::Lost(e.to_string());
             }
             let now = self.now();
@@ -358,27 +359,22 @@ impl Daemon {
                         robot,
                     });
                 }
-                match &event {
-                    Event::Engaged { .. } => marks.engaged.get_or_insert(self.meter.counts()),
-                    _ => &mut Counts::default(),
-                };
+                if matches!(event, Event::Engaged { .. }) {
+                    marks.granted.get_or_insert(marks.requested);
+                }
                 task.on_event(now, &event);
                 let _ = notices.send(Notice::Event(now, event));
             }
             let advice = task.advise(now, session);
             // Whoever says stop is not left before the robot says it has.
             if advice == Advice::Finished && !session.stop_is_unconfirmed() {
-                marks.released = Some(self.meter.counts());
-                return self.leave(session, link).await;
+                return self.leave(session, link, marks).await;
             }
             if (task.progress() - marks.progress).abs() >= 0.01 {
                 marks.progress = task.progress();
                 let _ = notices.send(Notice::Progress(marks.progress));
             }
-            if task.has_released() {
-                marks.released.get_or_insert(self.meter.counts());
-            }
-            if let Err(e) = self.flush(session, &mut link).await {
+            if let Err(e) = self.flush(session, &mut link, marks).await {
                 return End::Lost(e.to_string());
             }
             let due = [
@@ -389,7 +385,7 @@ impl Daemon {
             tokio::select! {
                 biased;
                 () = told(console.quit) => {
-                    let _ = self.leave(session, link).await;
+                    let _ = self.leave(session, link, marks).await;
                     return End::Quit;
                 }
                 Some(word) = console.words.recv() => match word {
@@ -418,7 +414,13 @@ impl Daemon {
         }
     }
 
-    async fn flush(&self, session: &mut Session, link: &mut Link) -> Result<(), ControlError> {
+    async fn flush(
+        &self,
+        session: &mut Session,
+        link: &mut Link,
+        marks: &mut Marks,
+    ) -> Result<(), ControlError> {
+        marks.on_request(session.requests(), self.meter.counts());
         while let Some(output) = session.poll_output() {
             match output {
                 Output::Control(payload) => write_frame(&mut link.send, &payload).await?,
@@ -435,12 +437,14 @@ impl Daemon {
     }
 
     /// Releases, says goodbye, and waits until the robot has read it.
-    async fn leave(&self, session: &mut Session, mut link: Link) -> End {
+    async fn leave(&self, session: &mut Session, mut link: Link, marks: &mut Marks) -> End {
         session.goodbye();
-        if self.flush(session, &mut link).await.is_ok() {
+        if self.flush(session, &mut link, marks).await.is_ok() {
             let _ = link.send.finish();
             let _ = timeout(Duration::from_secs(1), link.send.stopped()).await;
         }
+        // Only now has QUIC sent what it was given; after the release that is no motion any more.
+        marks.released = Some(self.meter.counts());
         link.connection.close(VarInt::from_u32(0), b"goodbye");
         End::Finished
     }
@@ -451,17 +455,27 @@ fn malformed(connection: &Connection, error: &DecodeError) -> String {
     format!("the robot sent a malformed message: {error}")
 }
 
-/// Traffic at the first engage and at the release.
+/// Traffic at the request that was granted and after the release.
 #[derive(Debug, Default)]
 struct Marks {
-    engaged: Option<Counts>,
+    requests: u32,
+    requested: Counts,
+    granted: Option<Counts>,
     released: Option<Counts>,
     progress: f64,
 }
 
 impl Marks {
+    /// Before anything that follows the newest request is handed to QUIC.
+    fn on_request(&mut self, requests: u32, counts: Counts) {
+        if self.requests != requests {
+            self.requests = requests;
+            self.requested = counts;
+        }
+    }
+
     fn span(&self, total: Counts) -> Counts {
-        let Some(from) = self.engaged else {
+        let Some(from) = self.granted else {
             return Counts::default();
         };
         self.released.unwrap_or(total).since(from)

@@ -289,12 +289,14 @@ fn sample_at(recording: &Recording, i: usize, started: Stamp) -> Option<HandSamp
         return Some(HandSample {
             t: started.offset_by_secs(i as f64 * REST_INTERVAL_S),
             x: first.1,
+            resting: true,
         });
     }
     let (t_s, x) = recording.samples.get(i - resting)?;
     Some(HandSample {
         t: started.offset_by_secs(recording.rest_s + t_s - first.0),
         x: *x,
+        resting: false,
     })
 }
 

@@ -115,6 +115,22 @@ fn the_tip_moves_with_the_hand() {
         44 * u64::from(run.summary.counters.samples),
     );
     assert!(sent > 0 && sent < raw, "{sent} B of motion, {raw} B raw");
+    let counters = run.summary.counters;
+    assert_eq!(
+        counters.samples as usize,
+        unseen().len(),
+        "no sample at rest"
+    );
+    assert!(
+        counters.rest_samples > 0,
+        "it engaged before the recording began"
+    );
+    let packets = run.summary.engaged.motion.packets;
+    assert_eq!(
+        packets,
+        u64::from(counters.messages),
+        "every motion, from the request to the release"
+    );
 }
 
 #[test]

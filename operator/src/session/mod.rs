@@ -77,6 +77,8 @@ pub struct HandSample {
     pub t: Stamp,
     /// Position, m.
     pub x: Vector3<f64>,
+    /// Made up, so that a recording begins at rest: followed like any other, and counted apart.
+    pub resting: bool,
 }
 
 /// What a session wants sent.
@@ -118,9 +120,11 @@ pub enum Event {
 /// What the session counts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Samples taken while engaged.
+    /// Samples taken from the request that was granted to the release, those made up at rest left out.
     pub samples: u32,
-    /// Motions and goes sent.
+    /// Those at rest.
+    pub rest_samples: u32,
+    /// Motions and goes sent, from that request on.
     pub messages: u32,
     /// Path knots made.
     pub knots: u32,
@@ -132,6 +136,7 @@ impl Counters {
     /// Adds another session's counts.
     pub fn add(&mut self, other: Self) {
         self.samples += other.samples;
+        self.rest_samples += other.rest_samples;
         self.messages += other.messages;
         self.knots += other.knots;
         self.dropped += other.dropped;
@@ -166,6 +171,8 @@ pub struct Session {
     last_sent: Stamp,
     next_stop: Option<Stamp>,
     counters: Counters,
+    /// As they were at the request that is not answered yet.
+    before: Option<Counters>,
     outputs: VecDeque<Output>,
     events: VecDeque<Event>,
 }
@@ -200,6 +207,7 @@ impl Session {
             last_sent: Stamp::ZERO,
             next_stop: None,
             counters: Counters::default(),
+            before: None,
             outputs: VecDeque::new(),
             events: VecDeque::new(),
         }
@@ -218,6 +226,11 @@ impl Session {
     /// The robot's state, as last heard.
     pub fn state(&self) -> RobotState {
         self.state
+    }
+
+    /// Requests made so far.
+    pub fn requests(&self) -> u32 {
+        self.engagement
     }
 
     /// The counters.
@@ -281,6 +294,7 @@ impl Session {
                 tip_m,
                 ..
             } => {
+                self.before = None;
                 self.events.push_back(Event::Engaged {
                     engagement,
                     hand_m,
@@ -293,6 +307,11 @@ impl Session {
                     mirror.go_without_model();
                 } else {
                     self.activity = Activity::Nothing;
+                    // What was sent for nothing is not what following took.
+                    if let Some(before) = self.before.take() {
+                        let dropped = self.counters.dropped;
+                        self.counters = Counters { dropped, ..before };
+                    }
                 }
                 self.events.push_back(Event::Refused(reason));
             }
@@ -360,7 +379,11 @@ impl Session {
         };
         let skill = self.skill.as_deref().filter(|_| self.model_stored);
         let lag_s = self.info.as_ref().map_or(0.0, |info| f64::from(info.lag_s));
-        self.counters.samples += 1;
+        if sample.resting {
+            self.counters.rest_samples += 1;
+        } else {
+            self.counters.samples += 1;
+        }
         self.counters.knots +=
             u32::from(mirror.take(&previous, *hand, skill, self.delay_s + lag_s));
         let backlog = mirror.backlog();
@@ -579,6 +602,7 @@ impl Session {
 
     fn request(&mut self, now: Stamp, drive: Drive) {
         self.engagement += 1;
+        self.before = Some(self.counters);
         let rotation = self.config.rotation.as_ref();
         let engage = Engage {
             engagement: self.engagement,

@@ -83,6 +83,40 @@ fn every_refusal_but_a_divergence_ends_the_attempt() {
 }
 
 #[test]
+fn what_a_declined_request_took_is_not_counted() {
+    let mut bench = Bench::ready(SessionConfig::default(), None);
+    bench.sample(home());
+    for reason in [Refusal::ClockUnknown, Refusal::Moving] {
+        bench.session.engage(bench.now);
+        (0..30).for_each(|i| bench.sample(home() * f64::from(1 + i % 2)));
+        let counters = bench.session.counters();
+        assert!(counters.samples == 30 && counters.messages > 5 && counters.knots > 5);
+        bench.hears(&refused(reason));
+        assert_eq!(bench.session.counters(), Counters::default());
+    }
+    bench.session.engage(bench.now);
+    for i in 0..10 {
+        bench.now.0 += 33 * MS;
+        let sample = HandSample {
+            t: bench.now,
+            x: home(),
+            resting: i < 7,
+        };
+        bench.session.handle_sample(bench.now, sample);
+    }
+    let counters = bench.session.counters();
+    assert_eq!((counters.rest_samples, counters.samples), (7, 3));
+    bench.hears(&RobotControl::Engaged {
+        engagement: 3,
+        t_us: 0,
+        hand_m: [0.0; 3],
+        tip_m: [0.0; 3],
+    });
+    bench.hears(&refused(Refusal::NotYours));
+    assert_eq!(bench.session.counters(), counters, "that was no request");
+}
+
+#[test]
 fn after_a_divergence_the_model_is_named_no_more() {
     let mut bench = Bench::engaged(SessionConfig::default(), Some(example(2, 24)));
     bench.sample(home() + Vector3::x() * 0.3);

@@ -170,7 +170,12 @@ fn late_repeated_and_impossible_samples_are_dropped_and_counted() {
         (Stamp(bench.now.0 - MS), home() + Vector3::x()),
         (Stamp(bench.now.0 + MS), Vector3::repeat(f64::NAN)),
     ] {
-        bench.session.handle_sample(bench.now, HandSample { t, x });
+        let sample = HandSample {
+            t,
+            x,
+            resting: false,
+        };
+        bench.session.handle_sample(bench.now, sample);
     }
     bench.drain();
     assert!(bench.datagrams.is_empty());
