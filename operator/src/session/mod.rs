@@ -28,6 +28,9 @@ use mirror::Mirror;
 /// While an emergency stop is not confirmed, it is repeated at this interval, s.
 const STOP_REPEAT_S: f64 = 0.01;
 
+/// In play the operator speaks at least this often, s: a lost go must not make the arm coast, and it costs little.
+pub const GO_S: f64 = 0.1;
+
 /// How far the robot's prediction may be off before the operator speaks.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum FutureBound {
@@ -530,9 +533,11 @@ impl Session {
     fn next_word(&self) -> Option<Stamp> {
         match self.activity {
             Activity::Nothing | Activity::Play { engaged: false, .. } => None,
-            Activity::Mirror(_) | Activity::Play { engaged: true, .. } => {
-                Some(self.last_sent.offset_by_secs(self.config.max_silence_s))
-            }
+            Activity::Mirror(_) => Some(self.last_sent.offset_by_secs(self.config.max_silence_s)),
+            Activity::Play { engaged: true, .. } => Some(
+                self.last_sent
+                    .offset_by_secs(self.config.max_silence_s.min(GO_S)),
+            ),
         }
     }
 

@@ -217,12 +217,12 @@ fn a_plan_is_engaged_once_stored_and_kept_going() {
     );
     let begun = bench.now;
     bench.idle(1000);
-    let expected: Vec<_> = (1..=5)
+    let expected: Vec<_> = (1..=10)
         .map(|i| OperatorDatagram::Go {
             epoch: EPOCH,
             engagement: 1,
             seq: i,
-            t_us: begun.0 / 1000 + 200_000 * i64::from(i),
+            t_us: begun.0 / 1000 + 100_000 * i64::from(i),
             lease_ms: 650,
         })
         .collect();
