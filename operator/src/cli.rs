@@ -125,6 +125,12 @@ impl Axes {
     }
 }
 
+/// Longest silence that still lets the arm follow at full speed: the robot coasts after 0.26 s.
+const MAX_SILENCE_S: f64 = 0.25;
+
+/// Longest lease the robot grants, s.
+const MAX_LEASE_S: f64 = 1.0;
+
 fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
     let wrong = || {
         format!("`{text}`: write a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)")
@@ -236,8 +242,10 @@ impl Args {
             }
             Ok(())
         };
-        within("--max-silence", config.max_silence_s, 0.005, 5.0)?;
-        within("--lease", config.lease_s, config.max_silence_s, 10.0)?;
+        within("--max-silence", config.max_silence_s, 0.005, MAX_SILENCE_S)
+            .context("the robot coasts after 0.26 s without news")?;
+        within("--lease", config.lease_s, config.max_silence_s, MAX_LEASE_S)
+            .context("the robot grants 1 s at most, and a lease must outlast the silence")?;
         within("--gain", config.gain, -f64::EPSILON, 1.0)?;
         if let Some(scale) = config.scale {
             within("--scale", scale, 0.0, 10.0)?;
@@ -421,13 +429,28 @@ mod tests {
 
     #[test]
     fn impossible_settings_are_refused_by_name() {
-        let refused = |args: Args| args.session().unwrap_err().to_string();
+        let refused = |args: Args| format!("{:#}", args.session().unwrap_err());
         assert!(
             refused(Args {
                 lease: Some(0.1),
                 ..Args::default()
             })
             .contains("--lease")
+        );
+        // What the robot would cut down in silence.
+        assert!(
+            refused(Args {
+                lease: Some(1.5),
+                ..Args::default()
+            })
+            .contains("1 s at most")
+        );
+        assert!(
+            refused(Args {
+                max_silence: Some(0.3),
+                ..Args::default()
+            })
+            .contains("0.26 s")
         );
         assert!(
             refused(Args {

@@ -262,13 +262,14 @@ impl Daemon {
         loop {
             let dialled = console.beside(stop, timeout(attempt, self.connect())).await;
             attempt = (attempt * 2).min(LONGEST_ATTEMPT);
+            let patient = self.now().secs_since(begun) <= self.patience.as_secs_f64();
             let why = match dialled {
                 Ok(Ok(link)) => return Ok(Some(link)),
-                // An operator that lost its link may find its own old session still in authority.
+                // An operator that lost its link, or comes back, may find its own old session still in authority.
                 Ok(Err(DialError::Rejected {
                     code: RejectCode::Busy,
                     text,
-                })) if !first => text,
+                })) if !first || patient => text,
                 Ok(Err(DialError::Rejected { code, text })) => {
                     return Err(DaemonError::Rejected {
                         addr: self.robot,
@@ -279,7 +280,7 @@ impl Daemon {
                 Ok(Err(DialError::Again(why))) => why,
                 Err(_) => "no answer: is the robot running, and does UDP reach it?".to_owned(),
             };
-            if first && self.now().secs_since(begun) > self.patience.as_secs_f64() {
+            if first && !patient {
                 return Err(DaemonError::Unreachable {
                     addr: self.robot,
                     why,

@@ -1,5 +1,7 @@
 //! The host's monotonic clock, which paused tokio time can stand in for.
 
+use std::time::Duration;
+
 use rustix::time::{ClockId, clock_gettime};
 use tokio::time::Instant;
 
@@ -20,6 +22,12 @@ impl Mono {
     }
 }
 
+/// Two clocks read this close together are paired without another try.
+const NARROW: Duration = Duration::from_micros(50);
+
+/// Tries to pair them.
+const TRIES: u32 = 32;
+
 /// Reads [`Mono`] through tokio's clock: real time in the daemons, virtual time under
 /// `tokio::time::pause`, with nothing to configure.
 #[derive(Clone, Copy, Debug)]
@@ -31,11 +39,28 @@ pub struct HostClock {
 impl HostClock {
     /// A clock that reads `CLOCK_MONOTONIC`.
     pub fn new() -> Self {
-        let now = clock_gettime(ClockId::Monotonic);
-        Self {
-            instant: Instant::now(),
-            mono_ns: now.tv_sec * 1_000_000_000 + now.tv_nsec,
+        Self::between(Instant::now, || {
+            let now = clock_gettime(ClockId::Monotonic);
+            now.tv_sec * 1_000_000_000 + now.tv_nsec
+        })
+    }
+
+    /// Pairs a reading of one clock with the middle of two of the other around it. A process that is put aside in
+    /// between would be off by that long for good, so the narrowest of some tries counts.
+    fn between(mut instant: impl FnMut() -> Instant, mut mono_ns: impl FnMut() -> i64) -> Self {
+        let mut best: Option<(Duration, Self)> = None;
+        for _ in 0..TRIES {
+            let (before, mono_ns, after) = (instant(), mono_ns(), instant());
+            let gap = after.duration_since(before);
+            if best.as_ref().is_none_or(|(least, _)| gap < *least) {
+                let instant = before + gap / 2;
+                best = Some((gap, Self { instant, mono_ns }));
+            }
+            if gap < NARROW {
+                break;
+            }
         }
+        best.map_or_else(Self::from_zero, |(_, clock)| clock)
     }
 
     /// A clock whose zero is now: virtual runs start alike.
@@ -54,12 +79,43 @@ impl HostClock {
     /// The tokio instant at which this clock reads `at`; now, if that has passed.
     pub fn instant(&self, at: Mono) -> Instant {
         let ahead = at.0.saturating_sub(self.mono_ns).max(0) as u64;
-        self.instant + std::time::Duration::from_nanos(ahead)
+        self.instant + Duration::from_nanos(ahead)
     }
 }
 
 impl Default for HostClock {
     fn default() -> Self {
         Self::new()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pause_between_two_readings_does_not_shift_the_clock() {
+        let base = Instant::now();
+        let ms = Duration::from_millis;
+        // Put aside for 30 ms in the first try, for 2 ms in the second; then read at once.
+        let mut instants = [0, 30, 40, 42, 50, 50].into_iter();
+        let mut monos = [1, 41, 50].into_iter();
+        let clock = HostClock::between(
+            || base + ms(instants.next().unwrap()),
+            || monos.next().unwrap() * 1_000_000,
+        );
+        assert_eq!(clock.instant(Mono(80_000_000)), base + ms(80));
+        assert_eq!(instants.next(), None, "narrow enough: no further try");
+        // Never narrow: there is an end to it, and the middle of the least wide counts.
+        let mut read = 0;
+        let clock = HostClock::between(
+            || {
+                read += 1;
+                base + ms(read * 4)
+            },
+            || 0,
+        );
+        assert_eq!(clock.instant(Mono(0)), base + ms(6));
+        assert_eq!(read, 2 * u64::from(TRIES));
     }
 }
