@@ -80,6 +80,9 @@ pub struct Args {
     /// The operator speaks at least this often, s [default: 0.2].
     #[arg(long, value_name = "S")]
     pub max_silence: Option<f64>,
+    /// Two motions are at least this far apart, s, however fast the samples come [default: 0.01].
+    #[arg(long, value_name = "S")]
+    pub min_interval: Option<f64>,
     /// Each message authorises motion for this long, s [default: 0.65].
     #[arg(long, value_name = "S")]
     pub lease: Option<f64>,
@@ -176,6 +179,7 @@ struct File {
     future_bound: Option<String>,
     path_bound_m: Option<f64>,
     max_silence_s: Option<f64>,
+    min_interval_s: Option<f64>,
     lease_s: Option<f64>,
     rest_s: Option<f64>,
     patience_s: Option<f64>,
@@ -218,6 +222,7 @@ impl Args {
         self.future_bound = self.future_bound.or(bound);
         self.path_bound = self.path_bound.or(file.path_bound_m);
         self.max_silence = self.max_silence.or(file.max_silence_s);
+        self.min_interval = self.min_interval.or(file.min_interval_s);
         self.lease = self.lease.or(file.lease_s);
         self.rest = self.rest.or(file.rest_s);
         self.patience = self.patience.or(file.patience_s);
@@ -229,6 +234,7 @@ impl Args {
         let defaults = SessionConfig::default();
         let config = SessionConfig {
             max_silence_s: self.max_silence.unwrap_or(defaults.max_silence_s),
+            min_interval_s: self.min_interval.unwrap_or(defaults.min_interval_s),
             lease_s: self.lease.unwrap_or(defaults.lease_s),
             future_bound: self.future_bound.unwrap_or(defaults.future_bound),
             path_bound_m: self.path_bound,
@@ -246,6 +252,12 @@ impl Args {
             .context("the robot coasts after 0.26 s without news")?;
         within("--lease", config.lease_s, config.max_silence_s, MAX_LEASE_S)
             .context("the robot grants 1 s at most, and a lease must outlast the silence")?;
+        within(
+            "--min-interval",
+            config.min_interval_s,
+            -f64::EPSILON,
+            config.max_silence_s,
+        )?;
         within("--gain", config.gain, -f64::EPSILON, 1.0)?;
         if let Some(scale) = config.scale {
             within("--scale", scale, 0.0, 10.0)?;

@@ -45,6 +45,8 @@ pub enum FutureBound {
 pub struct SessionConfig {
     /// The operator speaks at least this often, s.
     pub max_silence_s: f64,
+    /// Two motions are at least this far apart, s, however fast the samples come.
+    pub min_interval_s: f64,
     /// For how long each message authorises motion, s.
     pub lease_s: f64,
     /// ε_future.
@@ -63,6 +65,7 @@ impl Default for SessionConfig {
     fn default() -> Self {
         Self {
             max_silence_s: 0.2,
+            min_interval_s: 0.01,
             lease_s: 0.65,
             future_bound: FutureBound::Relative(0.6),
             path_bound_m: None,
@@ -172,6 +175,8 @@ pub struct Session {
     plans: u32,
     delay_s: f64,
     last_sent: Stamp,
+    /// There was something to say before the shortest interval was over.
+    urgent: bool,
     next_stop: Option<Stamp>,
     counters: Counters,
     /// As they were at the request that is not answered yet.
@@ -208,6 +213,7 @@ impl Session {
             plans: 0,
             delay_s: 0.0,
             last_sent: Stamp::ZERO,
+            urgent: false,
             next_stop: None,
             counters: Counters::default(),
             before: None,
@@ -395,7 +401,11 @@ impl Session {
         if mirror.future_changed(arrival, self.config.future_bound)
             || silent_s >= self.config.max_silence_s
         {
-            self.speak(now);
+            // Within the shortest interval the news waits, and what is then said is the newest.
+            self.urgent = silent_s < self.config.min_interval_s;
+            if !self.urgent {
+                self.speak(now);
+            }
         }
         if let Some(tail) = backlog {
             self.path(tail);
@@ -533,7 +543,11 @@ impl Session {
     fn next_word(&self) -> Option<Stamp> {
         match self.activity {
             Activity::Nothing | Activity::Play { engaged: false, .. } => None,
-            Activity::Mirror(_) => Some(self.last_sent.offset_by_secs(self.config.max_silence_s)),
+            Activity::Mirror(_) => Some(self.last_sent.offset_by_secs(if self.urgent {
+                self.config.min_interval_s
+            } else {
+                self.config.max_silence_s
+            })),
             Activity::Play { engaged: true, .. } => Some(
                 self.last_sent
                     .offset_by_secs(self.config.max_silence_s.min(GO_S)),
@@ -544,6 +558,7 @@ impl Session {
     /// Sends the newest there is, whatever drives.
     fn speak(&mut self, now: Stamp) {
         self.last_sent = now;
+        self.urgent = false;
         self.seq += 1;
         let lease_ms = (self.config.lease_s * 1e3) as u16;
         let datagram = match &mut self.activity {

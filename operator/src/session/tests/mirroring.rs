@@ -370,3 +370,33 @@ fn what_was_acknowledged_is_not_sent_by_the_stream() {
     );
     assert_eq!(bench.session.counters().knots, made + 1);
 }
+
+#[test]
+fn however_fast_the_samples_come_motions_keep_their_distance() {
+    // Every sample is news, 1000 of them in a second.
+    let mut bench = Bench::engaged(bound(0.0), None);
+    bench.idle(100);
+    bench.forget();
+    let begun = bench.now;
+    let mut said = vec![begun];
+    for i in 0..1000 {
+        bench.idle(1);
+        let x = home() + Vector3::new((0.05 * f64::from(i)).sin(), f64::from(i % 7), 0.0) * 0.1;
+        let sample = HandSample {
+            t: bench.now,
+            x,
+            resting: false,
+        };
+        bench.session.handle_sample(bench.now, sample);
+        bench.drain();
+        let motions = bench.motions();
+        if let Some(motion) = motions.get(said.len() - 1) {
+            let age_us = bench.now.0 / 1000 - motion.state.t_us;
+            assert!(age_us <= 1000, "the newest is said: {age_us} us old");
+            said.push(bench.now);
+        }
+    }
+    assert!((90..=101).contains(&(said.len() - 1)), "{}", said.len() - 1);
+    let close = |w: &[Stamp]| w[1].secs_since(w[0]) < 0.01 - 1e-9;
+    assert!(!said[1..].windows(2).any(close));
+}
