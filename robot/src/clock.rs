@@ -9,7 +9,7 @@ use telemime_protocol::time::Stamp;
 const WINDOW: usize = 128;
 
 /// Exchanges before the estimate counts.
-const ENOUGH: usize = 4;
+const ENOUGH: usize = 3;
 
 /// How far two crystals may drift apart, s per s.
 const DRIFT: f64 = 50e-6;
@@ -26,6 +26,9 @@ struct Exchange {
     rtt_s: f64,
     offset_ns: i64,
 }
+
+/// So many exchanges in a row that no jitter explains are a step of a clock.
+const STEP_EXCHANGES: usize = 3;
 
 /// What applying the estimate did.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,6 +48,8 @@ pub enum Slew {
 pub struct SessionClock {
     exchanges: VecDeque<Exchange>,
     applied: Option<(Mono, f64)>,
+    /// The newest exchanges that disagree with what is applied by more than their own round trip allows.
+    strangers: usize,
 }
 
 impl SessionClock {
@@ -58,14 +63,26 @@ impl SessionClock {
         }
         let offset_ns =
             (t2.0.saturating_sub(t1.0) / 2).saturating_add(t3.0.saturating_sub(t4.0) / 2);
-        if self.exchanges.len() == WINDOW {
-            self.exchanges.pop_front();
-        }
-        self.exchanges.push_back(Exchange {
+        let exchange = Exchange {
             at: t4,
             rtt_s: rtt_ns as f64 * 1e-9,
             offset_ns,
-        });
+        };
+        self.strangers = if self.disagrees(&exchange) {
+            self.strangers + 1
+        } else {
+            0
+        };
+        if self.strangers >= STEP_EXCHANGES {
+            // A short round trip from before the step would outvote everything since for half a minute.
+            let old = self.exchanges.len().saturating_sub(STEP_EXCHANGES - 1);
+            self.exchanges.drain(..old);
+            self.strangers = 0;
+        }
+        if self.exchanges.len() == WINDOW {
+            self.exchanges.pop_front();
+        }
+        self.exchanges.push_back(exchange);
     }
 
     /// Moves the applied offset towards the estimate; at once while `following` is false.
@@ -117,6 +134,14 @@ impl SessionClock {
     /// The shortest round trip seen lately, s.
     pub fn rtt_s(&self) -> Option<f64> {
         self.exchanges.iter().map(|e| e.rtt_s).reduce(f64::min)
+    }
+
+    /// Whether half the exchange's round trip and a step's margin do not explain what it says.
+    fn disagrees(&self, exchange: &Exchange) -> bool {
+        self.applied.is_some_and(|(_, applied_ns)| {
+            let error_s = (exchange.offset_ns as f64 - applied_ns).abs() * 1e-9;
+            error_s > exchange.rtt_s / 2.0 + STEP_S
+        })
     }
 
     fn best(&self, now: Mono) -> Option<&Exchange> {
@@ -208,5 +233,23 @@ mod tests {
             6,
             "a negative round trip is no exchange"
         );
+    }
+
+    #[test]
+    fn a_step_is_noticed_within_a_second_whatever_the_jitter() {
+        for seed in 0..20 {
+            let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
+            let mut delay = || rng.random_range(90 * MS..110 * MS);
+            let mut clock = SessionClock::default();
+            for i in 0..100 {
+                exchange(&mut clock, i * 250 * MS, 0, delay(), delay());
+                assert_eq!(clock.slew(Mono((i * 250 + 240) * MS), true), Slew::Smooth);
+            }
+            let stepped = (100..).find(|&i| {
+                exchange(&mut clock, i * 250 * MS, 400 * MS, delay(), delay());
+                clock.slew(Mono((i * 250 + 240) * MS), true) == Slew::Step
+            });
+            assert!(stepped.is_some_and(|i| i < 104), "seed {seed}: {stepped:?}");
+        }
     }
 }
