@@ -58,7 +58,7 @@ fn run(rig: &Rig, seed: u64) -> Run {
 impl Run {
     /// What the arm did, as hand positions.
     fn tip(&self) -> Track {
-        let engaged = self.reports.iter().filter(|r| r.engagement != 0);
+        let engaged = self.reports.iter().filter(|r| r.engagement.number != 0);
         let point = |r: &Report| {
             let t_s = (r.at.0 - self.zero) as f64 * 1e-9;
             (t_s, r.mapping.unplace(r.tip_m))

@@ -62,7 +62,7 @@ fn a_skill_is_played_from_checkpoints_to_tip() {
         );
 
         let reports = pair.robot.reports();
-        let first = reports.iter().find(|r| r.engagement == 1).unwrap();
+        let first = reports.iter().find(|r| r.engagement.number == 1).unwrap();
         assert!((first.mapping.hand_m - rebuilt.eval(0.0).unwrap().x).norm() < 1e-9);
         let (mut worst_m, mut ticks) = (0.0f64, 0);
         for r in reports.iter().filter(|r| r.state == RobotState::Engaged) {
