@@ -198,6 +198,7 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
     let engage = |drive| {
         OperatorControl::Engage(Engage {
             engagement: 1,
+            t_us: 3_010_000,
             drive,
             scale: 0.125,
             rotation,
@@ -260,6 +261,7 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
             message(&RobotControl::State {
                 state: RobotState::Holding,
                 cause: Cause::LeaseExpired,
+                changes: 9,
             }),
         ),
         (
@@ -453,6 +455,7 @@ fn a_plan_that_does_not_begin_at_zero_is_refused() {
     });
     let said = ask(OperatorControl::Engage(Engage {
         engagement: 1,
+        t_us: 0,
         drive: Drive::Play { plan: 1 },
         scale: 0.1,
         rotation: [1.0, 0.0, 0.0, 0.0],

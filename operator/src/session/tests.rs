@@ -96,6 +96,7 @@ impl Bench {
         bench.hears(&RobotControl::State {
             state: RobotState::Engaged,
             cause: Cause::Requested,
+            changes: 1,
         });
         bench.forget();
         bench

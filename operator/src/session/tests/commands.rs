@@ -2,12 +2,19 @@
 
 use super::*;
 
+/// What the robot counts its changes to.
+const CHANGES: u32 = 5;
+
 fn refused(reason: Refusal) -> RobotControl {
     RobotControl::Refused { reason }
 }
 
 fn state(state: RobotState, cause: Cause) -> RobotControl {
-    RobotControl::State { state, cause }
+    RobotControl::State {
+        state,
+        cause,
+        changes: CHANGES,
+    }
 }
 
 fn plan() -> Plan<3> {
@@ -138,7 +145,11 @@ fn a_stop_is_repeated_until_the_robot_has_stopped() {
     assert_eq!(bench.session.poll_timeout(), None);
     bench.session.reset();
     bench.drain();
-    assert_eq!(bench.control, [OperatorControl::Reset]);
+    assert_eq!(
+        bench.control,
+        [OperatorControl::Reset { changes: CHANGES }],
+        "the stop it was told of"
+    );
 }
 
 #[test]
