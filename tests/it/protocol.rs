@@ -430,6 +430,15 @@ fn a_plan_that_does_not_begin_at_zero_is_refused() {
     let report = rig.servo(rings).tick(Mono(0));
     let mut session = Session::new(SessionConfig::default(), rig.info(), 1, None, Mono(0));
     session.handle_report(&report, TickTiming::default());
+    for _ in 0..4 {
+        let pong = OperatorDatagram::Pong {
+            epoch: 1,
+            t1_us: 0,
+            t2_us: 0,
+            t3_us: 0,
+        };
+        session.handle_datagram(Mono(0), &pong.encode());
+    }
     let point = |t_s| Checkpoint {
         t_s,
         x: SVector::from([0.0, 0.0, t_s]),
