@@ -185,8 +185,11 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         ..RigOptions::default()
     };
     let rig = Rig::load(&options)?;
-    for notice in rig.arm.notices() {
-        eprintln!("note: {notice}");
+    // Of our own arm there is nothing to tell.
+    if options.urdf.is_some() {
+        for notice in rig.arm.notices() {
+            eprintln!("note: {notice}");
+        }
     }
     let recorder = args
         .record
