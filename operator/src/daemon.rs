@@ -1,6 +1,8 @@
 //! The operator's shell: dials, redials, feeds the session samples and moves its bytes.
 
+use std::future::Future;
 use std::net::SocketAddr;
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -81,7 +83,7 @@ pub struct Summary {
     pub counters: Counters,
     /// Traffic from first packet to last.
     pub total: Counts,
-    /// Traffic from engage to release.
+    /// Traffic from the request that was granted until the release had been sent.
     pub engaged: Counts,
     /// Sessions begun.
     pub sessions: u32,
@@ -109,6 +111,8 @@ pub enum Notice {
     Event(Stamp, Event),
     /// How far the task has got, in [0, 1]; a few times a second.
     Progress(f64),
+    /// What became of something the person at the terminal said.
+    Note(&'static str),
     /// The scale the next engagement uses, and ε_path, m.
     Mapping {
         /// Tip metres per hand metre.
@@ -131,6 +135,31 @@ struct Link {
 struct Console<'a> {
     quit: &'a mut watch::Receiver<bool>,
     words: &'a mut mpsc::UnboundedReceiver<Word>,
+    notices: &'a mpsc::UnboundedSender<Notice>,
+}
+
+impl Console<'_> {
+    /// Does `work` while nobody can be told: a stop is kept in `stop`, a reset is not.
+    async fn beside<T>(&mut self, stop: &mut bool, work: impl Future<Output = T>) -> T {
+        let mut work = pin!(work);
+        loop {
+            tokio::select! {
+                biased;
+                Some(word) = self.words.recv() => self.note(match word {
+                    Word::Stop => {
+                        *stop = true;
+                        "there is no link: the emergency stop is the first thing the robot will hear"
+                    }
+                    Word::Reset => "there is no link: the reset is discarded",
+                }),
+                done = &mut work => return done,
+            }
+        }
+    }
+
+    fn note(&self, text: &'static str) {
+        let _ = self.notices.send(Notice::Note(text));
+    }
 }
 
 enum DialError {
@@ -164,23 +193,32 @@ impl Daemon {
             sessions: 0,
         };
         let mut marks = Marks::default();
+        // Demanded, and not confirmed by the robot: outlives the session it was demanded in.
+        let mut stop = false;
         loop {
+            let mut hung_up = quit.clone();
+            let mut console = Console {
+                quit: &mut quit,
+                words: &mut words,
+                notices,
+            };
             let link = tokio::select! {
                 biased;
-                () = told(&mut quit) => break,
-                link = self.dial(summary.sessions == 0, task, notices) => link?,
+                () = told(&mut hung_up) => break,
+                link = self.dial(summary.sessions == 0, task, &mut console, &mut stop) => link?,
             };
             let Some(link) = link else { break };
             summary.sessions += 1;
             let _ = notices.send(Notice::Connected { epoch: link.epoch });
             let mut session = Session::new(self.config, self.skill.clone(), link.epoch);
-            let console = Console {
-                quit: &mut quit,
-                words: &mut words,
-            };
+            marks.requests = 0;
+            if stop {
+                session.stop(self.now());
+            }
             let end = self
-                .drive(&mut session, link, task, console, notices, &mut marks)
+                .drive(&mut session, link, task, console, &mut marks)
                 .await;
+            stop = session.stop_is_unconfirmed();
             summary.counters.add(session.counters());
             match end {
                 End::Finished | End::Quit => break,
@@ -192,6 +230,12 @@ impl Daemon {
         }
         self.endpoint.wait_idle().await;
         summary.outcome = task.outcome(*quit.borrow());
+        if stop {
+            summary.outcome = Outcome::Interrupted(
+                "the robot never confirmed the emergency stop; what stops its arm then is its lease"
+                    .into(),
+            );
+        }
         summary.total = self.meter.counts();
         summary.engaged = marks.span(summary.total);
         Ok(summary)
@@ -205,17 +249,18 @@ impl Daemon {
         self.clock.instant(Mono(at.0.saturating_add(self.epoch.0)))
     }
 
-    /// Dials until there is a session; `None` once the task is over anyway.
+    /// Dials until there is a session; `None` once the task is over anyway and no `stop` has to be delivered.
     async fn dial(
         &self,
         first: bool,
         task: &Task,
-        notices: &mpsc::UnboundedSender<Notice>,
+        console: &mut Console<'_>,
+        stop: &mut bool,
     ) -> Result<Option<Link>, DaemonError> {
         let begun = self.now();
         let mut attempt = FIRST_ATTEMPT;
         loop {
-            let dialled = timeout(attempt, self.connect()).await;
+            let dialled = console.beside(stop, timeout(attempt, self.connect())).await;
             attempt = (attempt * 2).min(LONGEST_ATTEMPT);
             let why = match dialled {
                 Ok(Ok(link)) => return Ok(Some(link)),
@@ -240,11 +285,12 @@ impl Daemon {
                     why,
                 });
             }
-            if task.is_over(self.now()) {
+            if task.is_over(self.now()) && !*stop {
                 return Ok(None);
             }
-            let _ = notices.send(Notice::Dialling { why });
-            sleep_until(self.instant(self.now().offset_by_secs(REDIAL_S))).await;
+            let _ = console.notices.send(Notice::Dialling { why });
+            let again = self.instant(self.now().offset_by_secs(REDIAL_S));
+            console.beside(stop, sleep_until(again)).await;
         }
     }
 
@@ -292,12 +338,11 @@ impl Daemon {
         mut link: Link,
         task: &mut Task,
         console: Console<'_>,
-        notices: &mpsc::UnboundedSender<Notice>,
         marks: &mut Marks,
     ) -> End {
-        let Console { quit, words } = console;
+        let notices = console.notices;
         loop {
-            if let Err(e) = self.flush(session, &mut link).await {
+            if let Err(e) = self.flush(session, &mut link, marks).await {
                 return End::Lost(e.to_string());
             }
             let now = self.now();
@@ -314,25 +359,22 @@ impl Daemon {
                         robot,
                     });
                 }
-                match &event {
-                    Event::Engaged { .. } => marks.engaged.get_or_insert(self.meter.counts()),
-                    _ => &mut Counts::default(),
-                };
+                if matches!(event, Event::Engaged { .. }) {
+                    marks.granted.get_or_insert(marks.requested);
+                }
                 task.on_event(now, &event);
                 let _ = notices.send(Notice::Event(now, event));
             }
-            if task.advise(now, session) == Advice::Finished {
-                marks.released = Some(self.meter.counts());
-                return self.leave(session, link).await;
+            let advice = task.advise(now, session);
+            // Whoever says stop is not left before the robot says it has.
+            if advice == Advice::Finished && !session.stop_is_unconfirmed() {
+                return self.leave(session, link, marks).await;
             }
             if (task.progress() - marks.progress).abs() >= 0.01 {
                 marks.progress = task.progress();
                 let _ = notices.send(Notice::Progress(marks.progress));
             }
-            if task.has_released() {
-                marks.released.get_or_insert(self.meter.counts());
-            }
-            if let Err(e) = self.flush(session, &mut link).await {
+            if let Err(e) = self.flush(session, &mut link, marks).await {
                 return End::Lost(e.to_string());
             }
             let due = [
@@ -342,13 +384,14 @@ impl Daemon {
             let due = due.into_iter().flatten().min();
             tokio::select! {
                 biased;
-                () = told(quit) => {
-                    let _ = self.leave(session, link).await;
+                () = told(console.quit) => {
+                    let _ = self.leave(session, link, marks).await;
                     return End::Quit;
                 }
-                Some(word) = words.recv() => match word {
+                Some(word) = console.words.recv() => match word {
                     Word::Stop => session.stop(self.now()),
-                    Word::Reset => session.reset(),
+                    Word::Reset if session.reset() => {}
+                    Word::Reset => console.note("the reset is discarded: the robot has not confirmed the stop yet"),
                 },
                 frame = link.frames.recv() => match frame {
                     Some(Ok(frame)) => {
@@ -371,7 +414,13 @@ impl Daemon {
         }
     }
 
-    async fn flush(&self, session: &mut Session, link: &mut Link) -> Result<(), ControlError> {
+    async fn flush(
+        &self,
+        session: &mut Session,
+        link: &mut Link,
+        marks: &mut Marks,
+    ) -> Result<(), ControlError> {
+        marks.on_request(session.requests(), self.meter.counts());
         while let Some(output) = session.poll_output() {
             match output {
                 Output::Control(payload) => write_frame(&mut link.send, &payload).await?,
@@ -388,12 +437,14 @@ impl Daemon {
     }
 
     /// Releases, says goodbye, and waits until the robot has read it.
-    async fn leave(&self, session: &mut Session, mut link: Link) -> End {
+    async fn leave(&self, session: &mut Session, mut link: Link, marks: &mut Marks) -> End {
         session.goodbye();
-        if self.flush(session, &mut link).await.is_ok() {
+        if self.flush(session, &mut link, marks).await.is_ok() {
             let _ = link.send.finish();
             let _ = timeout(Duration::from_secs(1), link.send.stopped()).await;
         }
+        // Only now has QUIC sent what it was given; after the release that is no motion any more.
+        marks.released = Some(self.meter.counts());
         link.connection.close(VarInt::from_u32(0), b"goodbye");
         End::Finished
     }
@@ -404,17 +455,27 @@ fn malformed(connection: &Connection, error: &DecodeError) -> String {
     format!("the robot sent a malformed message: {error}")
 }
 
-/// Traffic at the first engage and at the release.
+/// Traffic at the request that was granted and after the release.
 #[derive(Debug, Default)]
 struct Marks {
-    engaged: Option<Counts>,
+    requests: u32,
+    requested: Counts,
+    granted: Option<Counts>,
     released: Option<Counts>,
     progress: f64,
 }
 
 impl Marks {
+    /// Before anything that follows the newest request is handed to QUIC.
+    fn on_request(&mut self, requests: u32, counts: Counts) {
+        if self.requests != requests {
+            self.requests = requests;
+            self.requested = counts;
+        }
+    }
+
     fn span(&self, total: Counts) -> Counts {
-        let Some(from) = self.engaged else {
+        let Some(from) = self.granted else {
             return Counts::default();
         };
         self.released.unwrap_or(total).since(from)

@@ -227,6 +227,9 @@ impl Task {
 
     /// When [`Task::advise`] has something to do next.
     pub fn poll_timeout(&self) -> Option<Stamp> {
+        if self.phase == Phase::Over {
+            return None;
+        }
         // A replay asks with its next sample; only a plan is asked for by the clock.
         let retry = match (&self.work, self.phase) {
             (Work::Play { .. }, Phase::Waiting(at)) => at,
@@ -286,12 +289,14 @@ fn sample_at(recording: &Recording, i: usize, started: Stamp) -> Option<HandSamp
         return Some(HandSample {
             t: started.offset_by_secs(i as f64 * REST_INTERVAL_S),
             x: first.1,
+            resting: true,
         });
     }
     let (t_s, x) = recording.samples.get(i - resting)?;
     Some(HandSample {
         t: started.offset_by_secs(recording.rest_s + t_s - first.0),
         x: *x,
+        resting: false,
     })
 }
 

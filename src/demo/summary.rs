@@ -37,6 +37,7 @@ struct Result {
     messages: u32,
     checkpoints: u32,
     samples: u32,
+    samples_at_rest: u32,
     path_bound_m: f64,
     path_error_m: f64,
     path_samples: usize,
@@ -119,6 +120,7 @@ fn gather(
         .find(|e| matches!(e, Operator::Done { .. }));
     let Some(Operator::Done {
         samples,
+        samples_at_rest,
         messages,
         knots,
         bytes_on_wire,
@@ -162,6 +164,7 @@ fn gather(
         messages: *messages,
         checkpoints: *knots,
         samples: *samples,
+        samples_at_rest: *samples_at_rest,
         path_bound_m: path_bound_m.context("the operator never said how it maps")?,
         path_error_m: verdict.path_error_m,
         path_samples: verdict.path_samples,

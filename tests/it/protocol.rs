@@ -19,8 +19,8 @@ use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots;
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::v1::{
-    Cause, Drive, Engage, Info, Message, Motion, OperatorControl, OperatorDatagram, Refusal,
-    RobotControl, RobotDatagram, RobotState, Telemetry, WireParams, model_tag,
+    Cause, Drive, Engage, Info, Message, Motion, OperatorControl, OperatorDatagram, PathTail,
+    Refusal, RobotControl, RobotDatagram, RobotState, Telemetry, WireParams, model_tag,
 };
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo;
@@ -239,6 +239,16 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
         ("reject", reject.encode()),
         ("frame", frame::encode(&stop, false)),
         ("engage-mirror", message(&engage(mirror))),
+        (
+            "path",
+            message(&OperatorControl::Path(PathTail {
+                engagement: 1,
+                state: STATE,
+                first_knot: 3,
+                knots: motion(None).knots,
+            })),
+        ),
+        ("reset", message(&OperatorControl::Reset { changes: 9 })),
         ("engage-play", message(&engage(Drive::Play { plan: 1 }))),
         ("info", message(&RobotControl::Info(info()))),
         (
@@ -430,6 +440,7 @@ fn a_plan_that_does_not_begin_at_zero_is_refused() {
     let report = rig.servo(rings).tick(Mono(0));
     let mut session = Session::new(SessionConfig::default(), rig.info(), 1, None, Mono(0));
     session.handle_report(&report, TickTiming::default());
+    // Before it knows the clock it judges no request at all.
     for _ in 0..4 {
         let pong = OperatorDatagram::Pong {
             epoch: 1,
@@ -437,7 +448,7 @@ fn a_plan_that_does_not_begin_at_zero_is_refused() {
             t2_us: 0,
             t3_us: 0,
         };
-        session.handle_datagram(Mono(0), &pong.encode());
+        session.handle_datagram(Mono(1), &pong.encode());
     }
     let point = |t_s| Checkpoint {
         t_s,

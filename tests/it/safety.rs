@@ -288,6 +288,108 @@ fn a_second_stop_is_confirmed_and_the_repeats_end() {
     );
 }
 
+/// The link dies under way, `says` happens `after_s` later, and 3 s after that the link is back.
+async fn said_without_a_link(pair: &mut Pair, operator: &Operator, after_s: f64, says: &[Word]) {
+    full_speed(pair).await;
+    pair.network.set_down(true);
+    pair.run_for(after_s).await;
+    says.iter().for_each(|word| operator.say(*word));
+    pair.run_for(3.0).await;
+    assert!(
+        !pair
+            .robot
+            .reports()
+            .iter()
+            .any(|r| r.state == RobotState::Stopped)
+    );
+    pair.network.set_down(false);
+}
+
+#[test]
+fn a_stop_the_link_swallowed_is_made_once_it_is_back() {
+    // 0.05 s: the connection is not given up yet; 2 s: it is being dialled again.
+    for (after_s, says) in [(0.05, &[Word::Stop][..]), (2.0, &[Word::Stop, Word::Reset])] {
+        run_virtual(async {
+            let mut pair = Pair::start(&rig()).unwrap();
+            let operator = mirroring(&mut pair, &delayed(0.1), 31);
+            said_without_a_link(&mut pair, &operator, after_s, says).await;
+            let stopped = |r: &Report| r.state == RobotState::Stopped;
+            assert!(
+                pair.wait_for(10.0, stopped).await,
+                "{after_s} s: not stopped"
+            );
+            let (summary, _, notices) = finish(operator).await;
+            assert!(matches!(summary.unwrap().outcome, Outcome::Interrupted(_)));
+            let confirmed = Event::State(RobotState::Stopped, Cause::OperatorStop);
+            assert!(events(&notices).contains(&&confirmed));
+            assert_eq!(
+                pair.robot.reports().last().unwrap().cause,
+                Cause::OperatorStop
+            );
+        })
+        .unwrap();
+    }
+}
+
+#[test]
+fn a_stop_outlives_the_task_it_interrupts() {
+    run_virtual(async {
+        let mut pair = Pair::start(&rig()).unwrap();
+        let operator = mirroring(&mut pair, &delayed(0.1), 32);
+        said_without_a_link(&mut pair, &operator, 0.05, &[Word::Stop]).await;
+        pair.network.set_down(true);
+        // Longer than the recording: nothing else is left to do.
+        pair.run_for(20.0).await;
+        assert!(
+            !operator.done.is_finished(),
+            "the stop is still to be delivered"
+        );
+        pair.network.set_down(false);
+        let stopped = |r: &Report| r.state == RobotState::Stopped;
+        assert!(pair.wait_for(12.0, stopped).await);
+        finish(operator).await.0.unwrap();
+    })
+    .unwrap();
+}
+
+#[test]
+fn an_operator_that_quits_says_that_its_stop_was_not_confirmed() {
+    run_virtual(async {
+        let mut pair = Pair::start(&rig()).unwrap();
+        let operator = mirroring(&mut pair, &delayed(0.1), 33);
+        full_speed(&pair).await;
+        pair.network.set_down(true);
+        pair.run_for(2.0).await;
+        operator.say(Word::Stop);
+        pair.run_for(0.5).await;
+        operator.quit();
+        let (summary, _, _) = finish(operator).await;
+        assert!(matches!(
+            summary.unwrap().outcome,
+            Outcome::Interrupted(why) if why.contains("never confirmed")
+        ));
+    })
+    .unwrap();
+}
+
+#[test]
+fn a_reset_without_a_link_is_said_to_be_discarded() {
+    run_virtual(async {
+        let mut pair = Pair::start(&rig()).unwrap();
+        let operator = mirroring(&mut pair, &delayed(0.1), 34);
+        said_without_a_link(&mut pair, &operator, 2.0, &[Word::Reset]).await;
+        let (_, _, notices) = finish(operator).await;
+        let discarded =
+            |n: &Notice| matches!(n, Notice::Note(text) if text.contains("reset is discarded"));
+        assert_eq!(notices.iter().filter(|n| discarded(n)).count(), 1);
+        assert_eq!(
+            pair.robot.reports().last().unwrap().state,
+            RobotState::Holding
+        );
+    })
+    .unwrap();
+}
+
 #[test]
 fn an_operator_that_quits_releases_the_arm() {
     run_virtual(async {

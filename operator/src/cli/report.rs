@@ -138,6 +138,7 @@ pub enum Event {
         zero_mono_ns: Option<i64>,
         epoch_mono_ns: i64,
         samples: u32,
+        samples_at_rest: u32,
         messages: u32,
         knots: u32,
         sessions: u32,
@@ -162,6 +163,7 @@ impl Event {
             zero_mono_ns: task.zero().map(|t| t.0 + epoch.0),
             epoch_mono_ns: epoch.0,
             samples: summary.counters.samples,
+            samples_at_rest: summary.counters.rest_samples,
             messages: summary.counters.messages,
             knots: summary.counters.knots,
             sessions: summary.sessions,
@@ -291,6 +293,7 @@ pub(super) async fn listen_to(
                 bar.set_position((done * 1e3) as u64);
                 Event::Progress { done }
             }
+            Notice::Note(text) => Event::Note { text: text.into() },
             Notice::Event(at, event) => match event {
                 session::Event::Ready => continue,
                 session::Event::Engaged { engagement, .. } => Event::Engaged {

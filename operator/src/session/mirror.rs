@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 
+use nalgebra::Vector3;
 use telemime_protocol::checkpoint::CheckpointError;
 use telemime_protocol::checkpoint::path::{PathEncoder, PathKnot};
 use telemime_protocol::predict::{Forecast, HandState, Params};
@@ -9,7 +10,9 @@ use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::knots;
 use telemime_protocol::wire::state::WireState;
-use telemime_protocol::wire::v1::{Motion, WireParams, model_tag};
+use telemime_protocol::wire::v1::{
+    MAX_TAIL_KNOTS, Motion, PathTail, WireKnot, WireParams, model_tag,
+};
 
 use super::FutureBound;
 use super::adapt::Adaptation;
@@ -17,8 +20,8 @@ use super::adapt::Adaptation;
 /// Knots in one message; the oldest unacknowledged first.
 const KNOTS_PER_MESSAGE: usize = 24;
 
-/// Unacknowledged knots held; beyond, the path is given up and starts afresh.
-const MAX_UNACKNOWLEDGED: usize = 512;
+/// More unacknowledged knots than this go by the stream at once: nothing of the path is ever given up.
+const BACKLOG: usize = 256;
 
 /// Every so many messages the robot's prediction is checked against ours.
 const KEYFRAME: u32 = 8;
@@ -114,17 +117,54 @@ impl Mirror {
         let Ok(Some(knot)) = self.path.push(hand.t, hand.x) else {
             return false;
         };
-        if self.unacknowledged.len() == MAX_UNACKNOWLEDGED {
-            self.unacknowledged.pop_front();
-            self.first_unacknowledged += 1;
-        }
-        let unsent = Unacknowledged {
+        self.hold(knot);
+        true
+    }
+
+    fn hold(&mut self, knot: PathKnot) {
+        self.unacknowledged.push_back(Unacknowledged {
             knot,
             copies: 0,
-            sent: hand.t,
-        };
-        self.unacknowledged.push_back(unsent);
-        true
+            sent: self.hand.t,
+        });
+    }
+
+    /// What goes by the stream because datagrams have not delivered it for too long.
+    pub(super) fn backlog(&mut self) -> Option<PathTail> {
+        if self.unacknowledged.len() > BACKLOG {
+            self.tail()
+        } else {
+            None
+        }
+    }
+
+    /// Closes the path at the newest sample; says whether that took another knot.
+    pub(super) fn close(&mut self) -> bool {
+        let last = self.path.flush();
+        last.map(|knot| self.hold(knot)).is_some()
+    }
+
+    /// The oldest unacknowledged knots for the stream but for the engagement, `None` if there are none. What is
+    /// handed over is forgotten: the stream delivers it as long as the engagement can live at all.
+    pub(super) fn tail(&mut self) -> Option<PathTail> {
+        // Only an origin is wanted, and one that can travel wherever the hand is.
+        let state = WireState::quantise(&HandState::first(self.hand.t, Vector3::zeros()))?;
+        let count = self.unacknowledged.len().min(MAX_TAIL_KNOTS);
+        let knots: Vec<_> = self
+            .unacknowledged
+            .iter()
+            .take(count)
+            .map(|u| u.knot)
+            .collect();
+        let knots = knots::pack(&state, self.path.grid(), &knots).filter(|k| !k.is_empty())?;
+        let first_knot = self.first_unacknowledged;
+        self.acknowledge(first_knot + count as u32);
+        Some(PathTail {
+            engagement: 0,
+            state,
+            first_knot,
+            knots,
+        })
     }
 
     /// Whether the robot's prediction for `arrival` would differ by more than the bound.
@@ -156,7 +196,7 @@ impl Mirror {
         self.messages += 1;
         let forecast = self.predict(skill)?;
         self.sent = Some(forecast);
-        let (first_knot, due) = self.due_knots(now, delay_s);
+        let (first_knot, knots) = self.due_knots(&state, now, delay_s);
         Some(Motion {
             epoch: 0,
             engagement: 0,
@@ -167,29 +207,32 @@ impl Mirror {
             checksum: (self.messages % KEYFRAME == 1).then(|| forecast.checksum()),
             state,
             first_knot,
-            knots: knots::pack(&state, self.path.grid(), &due).unwrap_or_default(),
+            knots,
         })
     }
 
     /// The knots for a message sent now, without a gap, and the number of the first.
-    fn due_knots(&mut self, now: Stamp, delay_s: f64) -> (u32, Vec<PathKnot>) {
+    fn due_knots(&mut self, state: &WireState, now: Stamp, delay_s: f64) -> (u32, Vec<WireKnot>) {
         let overdue = |u: &Unacknowledged| now.secs_since(u.sent) > 2.0 * delay_s + PATIENCE_S;
         let start = self
             .unacknowledged
             .iter()
             .position(|u| u.copies < COPIES || overdue(u));
         let start = start.unwrap_or(self.unacknowledged.len());
-        let due = self
-            .unacknowledged
-            .iter_mut()
-            .skip(start)
-            .take(KNOTS_PER_MESSAGE)
-            .map(|u| {
-                u.copies = u.copies.saturating_add(1);
-                u.sent = now;
-                u.knot
-            });
-        (self.first_unacknowledged + start as u32, due.collect())
+        let due = || start..self.unacknowledged.len().min(start + KNOTS_PER_MESSAGE);
+        let knots: Vec<_> = self.unacknowledged.range(due()).map(|u| u.knot).collect();
+        let packed = knots::pack(state, self.path.grid(), &knots);
+        if packed.is_some() {
+            let due = due();
+            for sent in self.unacknowledged.range_mut(due) {
+                sent.copies = sent.copies.saturating_add(1);
+                sent.sent = now;
+            }
+        }
+        (
+            self.first_unacknowledged + start as u32,
+            packed.unwrap_or_default(),
+        )
     }
 
     fn model(&self, skill: Option<&Skill>) -> u16 {

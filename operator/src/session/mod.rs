@@ -18,8 +18,8 @@ use telemime_protocol::skill::{Skill, Stats};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::v1::{
-    Cause, Drive, Engage, Info, Message, OperatorControl, OperatorDatagram, Refusal, RobotControl,
-    RobotDatagram, RobotState, Telemetry,
+    Cause, Drive, Engage, Info, Message, OperatorControl, OperatorDatagram, PathTail, Refusal,
+    RobotControl, RobotDatagram, RobotState, Telemetry,
 };
 use telemime_protocol::wire::{DecodeError, codec};
 
@@ -77,6 +77,8 @@ pub struct HandSample {
     pub t: Stamp,
     /// Position, m.
     pub x: Vector3<f64>,
+    /// Made up, so that a recording begins at rest: followed like any other, and counted apart.
+    pub resting: bool,
 }
 
 /// What a session wants sent.
@@ -118,9 +120,11 @@ pub enum Event {
 /// What the session counts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Samples taken while engaged.
+    /// Samples taken from the request that was granted to the release, those made up at rest left out.
     pub samples: u32,
-    /// Motions and goes sent.
+    /// Those at rest.
+    pub rest_samples: u32,
+    /// Motions and goes sent, from that request on.
     pub messages: u32,
     /// Path knots made.
     pub knots: u32,
@@ -132,6 +136,7 @@ impl Counters {
     /// Adds another session's counts.
     pub fn add(&mut self, other: Self) {
         self.samples += other.samples;
+        self.rest_samples += other.rest_samples;
         self.messages += other.messages;
         self.knots += other.knots;
         self.dropped += other.dropped;
@@ -166,6 +171,8 @@ pub struct Session {
     last_sent: Stamp,
     next_stop: Option<Stamp>,
     counters: Counters,
+    /// As they were at the request that is not answered yet.
+    before: Option<Counters>,
     outputs: VecDeque<Output>,
     events: VecDeque<Event>,
 }
@@ -200,6 +207,7 @@ impl Session {
             last_sent: Stamp::ZERO,
             next_stop: None,
             counters: Counters::default(),
+            before: None,
             outputs: VecDeque::new(),
             events: VecDeque::new(),
         }
@@ -218,6 +226,11 @@ impl Session {
     /// The robot's state, as last heard.
     pub fn state(&self) -> RobotState {
         self.state
+    }
+
+    /// Requests made so far.
+    pub fn requests(&self) -> u32 {
+        self.engagement
     }
 
     /// The counters.
@@ -281,6 +294,7 @@ impl Session {
                 tip_m,
                 ..
             } => {
+                self.before = None;
                 self.events.push_back(Event::Engaged {
                     engagement,
                     hand_m,
@@ -293,6 +307,11 @@ impl Session {
                     mirror.go_without_model();
                 } else {
                     self.activity = Activity::Nothing;
+                    // What was sent for nothing is not what following took.
+                    if let Some(before) = self.before.take() {
+                        let dropped = self.counters.dropped;
+                        self.counters = Counters { dropped, ..before };
+                    }
                 }
                 self.events.push_back(Event::Refused(reason));
             }
@@ -360,9 +379,14 @@ impl Session {
         };
         let skill = self.skill.as_deref().filter(|_| self.model_stored);
         let lag_s = self.info.as_ref().map_or(0.0, |info| f64::from(info.lag_s));
-        self.counters.samples += 1;
+        if sample.resting {
+            self.counters.rest_samples += 1;
+        } else {
+            self.counters.samples += 1;
+        }
         self.counters.knots +=
             u32::from(mirror.take(&previous, *hand, skill, self.delay_s + lag_s));
+        let backlog = mirror.backlog();
         let arrival = now.offset_by_secs(self.delay_s + lag_s);
         let silent_s = now.secs_since(self.last_sent);
         if mirror.future_changed(arrival, self.config.future_bound)
@@ -370,10 +394,16 @@ impl Session {
         {
             self.speak(now);
         }
+        if let Some(tail) = backlog {
+            self.path(tail);
+        }
     }
 
-    /// Asks the robot to follow the hand; refused here if no sample has been taken yet.
+    /// Asks the robot to follow the hand; refused here if no sample has been taken yet, or a stop is under way.
     pub fn engage(&mut self, now: Stamp) {
+        if self.refuses() {
+            return;
+        }
         let Some(hand) = self.hand else {
             self.events
                 .push_back(Event::Refused(Refusal::StaleReference));
@@ -403,6 +433,9 @@ impl Session {
 
     /// Sends a motion and plays it as soon as the robot has it.
     pub fn play(&mut self, plan: &Plan<3>) {
+        if self.refuses() {
+            return;
+        }
         self.plans += 1;
         self.activity = Activity::Play {
             plan: self.plans,
@@ -414,8 +447,16 @@ impl Session {
         });
     }
 
-    /// Lets go of the clutch.
+    /// Lets go of the clutch, and sees to it that the robot holds the path up to the newest sample.
     pub fn release(&mut self) {
+        if let Activity::Mirror(mirror) = &mut self.activity {
+            self.counters.knots += u32::from(mirror.close());
+            while let Activity::Mirror(mirror) = &mut self.activity
+                && let Some(tail) = mirror.tail()
+            {
+                self.path(tail);
+            }
+        }
         if !matches!(self.activity, Activity::Nothing) {
             self.control(&OperatorControl::Release {
                 engagement: self.engagement,
@@ -431,11 +472,20 @@ impl Session {
         self.next_stop = Some(now);
     }
 
-    /// Leaves the latched stop.
-    pub fn reset(&mut self) {
-        self.next_stop = None;
+    /// Whether a stop was demanded that the robot has not confirmed.
+    pub fn stop_is_unconfirmed(&self) -> bool {
+        self.next_stop.is_some()
+    }
+
+    /// Leaves the latched stop; false if there is one that the robot has not confirmed: nobody knows yet what
+    /// would be left.
+    pub fn reset(&mut self) -> bool {
+        if self.stop_is_unconfirmed() {
+            return false;
+        }
         let changes = self.changes;
         self.control(&OperatorControl::Reset { changes });
+        true
     }
 
     /// Ends the session.
@@ -552,6 +602,7 @@ impl Session {
 
     fn request(&mut self, now: Stamp, drive: Drive) {
         self.engagement += 1;
+        self.before = Some(self.counters);
         let rotation = self.config.rotation.as_ref();
         let engage = Engage {
             engagement: self.engagement,
@@ -568,6 +619,19 @@ impl Session {
             lease_ms: (self.config.lease_s * 1e3) as u16,
         };
         self.control(&OperatorControl::Engage(engage));
+    }
+
+    fn refuses(&mut self) -> bool {
+        let stopping = self.stop_is_unconfirmed();
+        if stopping {
+            self.events.push_back(Event::Refused(Refusal::Stopped));
+        }
+        stopping
+    }
+
+    fn path(&mut self, tail: PathTail) {
+        let engagement = self.engagement;
+        self.control(&OperatorControl::Path(PathTail { engagement, ..tail }));
     }
 
     fn control(&mut self, message: &OperatorControl) {

@@ -151,7 +151,11 @@ impl Bench {
     /// Lets 33 ms pass with everything that falls due, then takes a sample.
     fn sample(&mut self, x: Vector3<f64>) {
         self.idle(33);
-        let sample = HandSample { t: self.now, x };
+        let sample = HandSample {
+            t: self.now,
+            x,
+            resting: false,
+        };
         self.session.handle_sample(self.now, sample);
         self.drain();
     }

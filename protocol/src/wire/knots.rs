@@ -2,7 +2,7 @@
 
 use super::state::WireState;
 use super::v1::WireKnot;
-use crate::checkpoint::path::{PathGrid, PathKnot, TICK_NS};
+use crate::checkpoint::path::{PathGrid, PathKnot, tick_of};
 
 /// The tick and the position (in steps of `grid`) that the first knot of a message is relative to.
 fn origin(state: &WireState, grid: PathGrid) -> (i64, [i32; 3]) {
@@ -10,7 +10,8 @@ fn origin(state: &WireState, grid: PathGrid) -> (i64, [i32; 3]) {
     let steps = state.x / grid.step_m();
     // `as` saturates; both ends compute it from the same integers.
     (
-        state.t.0.div_euclid(TICK_NS),
+        // Rounded as knots are: one at the state's own instant must not lie after it.
+        tick_of(state.t),
         [
             steps.x.round() as i32,
             steps.y.round() as i32,
@@ -74,6 +75,24 @@ mod tests {
     use crate::predict::HandState;
     use crate::time::Stamp;
     use nalgebra::Vector3;
+
+    #[test]
+    fn a_knot_at_the_states_own_instant_can_always_travel() {
+        let grid = PathGrid::for_bound(0.02).unwrap();
+        for ns in 0..20_000 {
+            let t = Stamp(3_000_000_000 + ns);
+            let state = HandState::first(t, Vector3::new(0.4, -0.2, 2.5));
+            let state = WireState::quantise(&state).unwrap();
+            let knot = PathKnot {
+                tick: tick_of(t),
+                x: [70, -40, 500],
+                v: [0; 3],
+                start: false,
+            };
+            let packed = pack(&state, grid, &[knot]).expect("no later than the state");
+            assert_eq!(unpack(&state, grid, &packed).next(), Some(knot), "{ns} ns");
+        }
+    }
 
     #[test]
     fn knots_come_back_and_a_later_one_is_refused() {

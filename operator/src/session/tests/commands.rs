@@ -83,6 +83,40 @@ fn every_refusal_but_a_divergence_ends_the_attempt() {
 }
 
 #[test]
+fn what_a_declined_request_took_is_not_counted() {
+    let mut bench = Bench::ready(SessionConfig::default(), None);
+    bench.sample(home());
+    for reason in [Refusal::ClockUnknown, Refusal::Moving] {
+        bench.session.engage(bench.now);
+        (0..30).for_each(|i| bench.sample(home() * f64::from(1 + i % 2)));
+        let counters = bench.session.counters();
+        assert!(counters.samples == 30 && counters.messages > 5 && counters.knots > 5);
+        bench.hears(&refused(reason));
+        assert_eq!(bench.session.counters(), Counters::default());
+    }
+    bench.session.engage(bench.now);
+    for i in 0..10 {
+        bench.now.0 += 33 * MS;
+        let sample = HandSample {
+            t: bench.now,
+            x: home(),
+            resting: i < 7,
+        };
+        bench.session.handle_sample(bench.now, sample);
+    }
+    let counters = bench.session.counters();
+    assert_eq!((counters.rest_samples, counters.samples), (7, 3));
+    bench.hears(&RobotControl::Engaged {
+        engagement: 3,
+        t_us: 0,
+        hand_m: [0.0; 3],
+        tip_m: [0.0; 3],
+    });
+    bench.hears(&refused(Refusal::NotYours));
+    assert_eq!(bench.session.counters(), counters, "that was no request");
+}
+
+#[test]
 fn after_a_divergence_the_model_is_named_no_more() {
     let mut bench = Bench::engaged(SessionConfig::default(), Some(example(2, 24)));
     bench.sample(home() + Vector3::x() * 0.3);
@@ -137,13 +171,20 @@ fn a_stop_is_repeated_until_the_robot_has_stopped() {
     bench.forget();
     bench.idle(20);
     assert_eq!(bench.datagrams.len(), 2, "no other state ends it");
+    assert!(!bench.session.reset(), "there is nothing to leave yet");
+    bench.session.engage(bench.now);
+    bench.session.play(&plan());
+    bench.drain();
+    assert!(bench.control.is_empty());
+    assert_eq!(bench.events, vec![Event::Refused(Refusal::Stopped); 2]);
+    assert!(bench.session.stop_is_unconfirmed());
     bench.hears(&state(RobotState::Stopped, Cause::OperatorStop));
     bench.forget();
     bench.idle(1000);
     bench.sample(home());
     assert!(bench.datagrams.is_empty());
     assert_eq!(bench.session.poll_timeout(), None);
-    bench.session.reset();
+    assert!(bench.session.reset());
     bench.drain();
     assert_eq!(
         bench.control,
@@ -194,30 +235,22 @@ fn a_plan_is_engaged_once_stored_and_kept_going() {
 
 #[test]
 fn release_and_goodbye_name_the_engagement_once() {
+    let farewell = [
+        OperatorControl::Release { engagement: 1 },
+        OperatorControl::Goodbye,
+    ];
     let mut bench = Bench::engaged(SessionConfig::default(), None);
     bench.session.release();
     bench.session.release();
     bench.session.goodbye();
     bench.sample(home() + Vector3::x());
-    assert_eq!(
-        bench.control,
-        [
-            OperatorControl::Release { engagement: 1 },
-            OperatorControl::Goodbye
-        ]
-    );
+    assert_eq!(bench.control, farewell);
     assert!(bench.datagrams.is_empty());
 
     let mut bench = Bench::engaged(SessionConfig::default(), None);
     bench.session.goodbye();
     bench.drain();
-    assert_eq!(
-        bench.control,
-        [
-            OperatorControl::Release { engagement: 1 },
-            OperatorControl::Goodbye
-        ]
-    );
+    assert_eq!(bench.control, farewell);
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use super::*;
 use nalgebra::UnitQuaternion;
-use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid, TICK_NS};
+use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid, TICK_NS, tick_of};
 use telemime_protocol::predict::Forecast;
 use telemime_protocol::wire::knots;
 use telemime_protocol::wire::v1::model_tag;
@@ -170,7 +170,12 @@ fn late_repeated_and_impossible_samples_are_dropped_and_counted() {
         (Stamp(bench.now.0 - MS), home() + Vector3::x()),
         (Stamp(bench.now.0 + MS), Vector3::repeat(f64::NAN)),
     ] {
-        bench.session.handle_sample(bench.now, HandSample { t, x });
+        let sample = HandSample {
+            t,
+            x,
+            resting: false,
+        };
+        bench.session.handle_sample(bench.now, sample);
     }
     bench.drain();
     assert!(bench.datagrams.is_empty());
@@ -259,7 +264,7 @@ fn the_robot_ends_with_the_whole_path_whatever_is_lost() {
         let first = path.knots().next().unwrap().t;
         let mut covered = 0;
         for (t, x) in &samples {
-            let tick = Stamp((t.0 + TICK_NS / 2).div_euclid(TICK_NS) * TICK_NS);
+            let tick = Stamp(tick_of(*t) * TICK_NS);
             if tick < first || tick > frontier {
                 continue;
             }
@@ -284,4 +289,84 @@ fn what_is_not_acknowledged_is_sent_again() {
         carried > 3 * made as usize,
         "{carried} carried, {made} made"
     );
+}
+
+/// What the robot makes of the path tails among `control`.
+fn by_stream(control: &[OperatorControl], grid: PathGrid) -> PathDecoder {
+    let mut path = PathDecoder::new(grid, 4096);
+    let mut frontier = 0;
+    for message in control {
+        let OperatorControl::Path(tail) = message else {
+            continue;
+        };
+        assert_eq!(
+            (tail.engagement, tail.first_knot),
+            (1, frontier),
+            "in order"
+        );
+        for knot in knots::unpack(&tail.state, grid, &tail.knots) {
+            path.append(&knot).unwrap();
+            frontier += 1;
+        }
+    }
+    path
+}
+
+#[test]
+fn a_path_that_no_datagram_delivers_goes_by_the_stream_to_its_last_sample() {
+    const BOUND_M: f64 = 0.002;
+    let config = SessionConfig {
+        path_bound_m: Some(BOUND_M),
+        ..bound(0.05)
+    };
+    let grid = PathGrid::for_bound(BOUND_M).unwrap();
+    let mut bench = Bench::engaged(config, None);
+    let mut samples = Vec::new();
+    for i in 0..1200 {
+        // Too abrupt for any span to cover two steps.
+        let x = home() + Vector3::new(f64::from(i * i % 17), f64::from(i % 5), 0.0) * 0.01;
+        bench.sample(x);
+        samples.push((bench.now, x));
+        let held = bench.control.len();
+        let made = bench.session.counters().knots as usize;
+        assert_eq!(held, made / 257, "one tail a backlog, {made} knots");
+    }
+    let end_before = by_stream(&bench.control, grid).frontier().unwrap();
+    assert!(bench.now.secs_since(end_before) < 257.0 * 0.033 + 0.1);
+    bench.session.release();
+    bench.drain();
+    let release = OperatorControl::Release { engagement: 1 };
+    assert_eq!(
+        bench.control.last(),
+        Some(&release),
+        "the path comes before"
+    );
+    let path = by_stream(&bench.control, grid);
+    for (t, x) in &samples {
+        let tick = Stamp(tick_of(*t) * TICK_NS);
+        let error_m = (path.eval(tick).expect("no hole, to the last").x - x).norm();
+        assert!(error_m <= BOUND_M, "{error_m} m off");
+    }
+}
+
+#[test]
+fn what_was_acknowledged_is_not_sent_by_the_stream() {
+    let mut bench = Bench::engaged(bound(0.05), None);
+    for i in 0..90 {
+        let phase = 0.37 * f64::from(i);
+        bench.sample(home() + Vector3::new(phase.sin(), phase.cos(), 0.0) * 0.3);
+    }
+    let made = bench.session.counters().knots;
+    bench.receives(&RobotDatagram::Telemetry(telemetry(1, made - 2)));
+    bench.session.release();
+    bench.drain();
+    let [OperatorControl::Path(tail), OperatorControl::Release { .. }] = &bench.control[..] else {
+        panic!("{:?}", bench.control)
+    };
+    assert_eq!(
+        (tail.first_knot, tail.knots.len()),
+        (made - 2, 3),
+        "two and the last"
+    );
+    assert_eq!(bench.session.counters().knots, made + 1);
 }

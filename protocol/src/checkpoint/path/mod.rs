@@ -153,8 +153,8 @@ impl PathGrid {
     }
 }
 
-/// The nearest tick.
-fn tick_of(t: Stamp) -> i64 {
+/// The tick nearest to `t`.
+pub fn tick_of(t: Stamp) -> i64 {
     // Saturating half a tick short of the end keeps `tick * TICK_NS` representable.
     t.0.clamp(i64::MIN + TICK_NS, i64::MAX - TICK_NS)
         .saturating_add(TICK_NS / 2)
