@@ -11,7 +11,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 use serde::Deserialize;
-use telemime_endpoint::cli;
+use telemime_endpoint::cli::{self, Printer};
 use telemime_endpoint::{Fingerprint, HostClock, Identity, Meter, Mono, quic};
 use tokio::sync::mpsc;
 
@@ -292,7 +292,11 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         .clone()
         .unwrap_or_else(|| cli::config_dir().join("operator.key"));
     let identity = Identity::load_or_create(&key)?;
-    let log = report::Log { json: args.json };
+    let (out, printing) = Printer::start().context("no thread to print from")?;
+    let log = report::Log {
+        json: args.json,
+        out,
+    };
     log.say(&Event::Fingerprint {
         fingerprint: identity.fingerprint().to_string(),
     });
@@ -309,7 +313,7 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         log.say(&Event::Plan(play));
     }
 
-    let (quit, words) = cli::listen(args.follow_stdin)?;
+    let (quit, words) = cli::listen(args.follow_stdin, || {})?;
     let meter = Meter::default();
     let local = SocketAddr::from(if robot.is_ipv4() {
         (std::net::IpAddr::from([0; 4]), 0)
@@ -332,12 +336,14 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     let (notices, heard) = mpsc::unbounded_channel();
     let epoch = daemon.epoch;
     let progress = std::io::stderr().is_terminal() && !args.json;
-    let listener = tokio::spawn(report::listen_to(heard, log, epoch, progress));
+    let listener = tokio::spawn(report::listen_to(heard, log.clone(), epoch, progress));
     let done = daemon.run(&mut task, quit, words, &notices).await;
     drop(notices);
     listener.await.context("the log ended early")?;
     let summary = done?;
     log.say(&Event::done(&summary, &task, epoch));
+    drop(log);
+    printing.finish();
     match summary.outcome {
         Outcome::Completed => Ok(()),
         Outcome::Interrupted(why) => bail!("{why}"),

@@ -43,6 +43,7 @@ fn operator_control() {
     let engage = |drive| {
         OperatorControl::Engage(Engage {
             engagement: 3,
+            t_us: 1_234_567,
             drive,
             scale: 0.125,
             rotation: [0.5, -0.5, 0.5, 0.5],
@@ -72,17 +73,30 @@ fn operator_control() {
         ),
         (
             engage(mirror),
-            "020300fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ffc8800000003e \
+            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ffc8800000003e \
              0000003f000000bf0000003f0000003ffb204efb8a02",
         ),
         (
             engage(Drive::Play { plan: 300 }),
-            "020301fb2c010000003e0000003f000000bf0000003f0000003ffb204efb8a02",
+            "0203fc0ead250001fb2c010000003e0000003f000000bf0000003f0000003ffb204efb8a02",
         ),
-        (OperatorControl::Release { engagement: 3 }, "0303"),
-        (OperatorControl::EmergencyStop, "04"),
-        (OperatorControl::Reset, "05"),
-        (OperatorControl::Goodbye, "06"),
+        (
+            OperatorControl::Path(PathTail {
+                engagement: 3,
+                state: STATE,
+                first_knot: 300,
+                knots: vec![WireKnot {
+                    dt: 7,
+                    dx: [1, -1, 2],
+                    v: [0, 3, -3],
+                }],
+            }),
+            "0303fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb2c010107020104000605",
+        ),
+        (OperatorControl::Release { engagement: 3 }, "0403"),
+        (OperatorControl::EmergencyStop, "05"),
+        (OperatorControl::Reset { changes: 9 }, "0609"),
+        (OperatorControl::Goodbye, "07"),
     ]);
 }
 
@@ -134,8 +148,9 @@ fn robot_control() {
             RobotControl::State {
                 state: RobotState::Coasting,
                 cause: Cause::NewsLate,
+                changes: 9,
             },
-            "050302",
+            "05030209",
         ),
     ]);
 }
@@ -261,6 +276,7 @@ fn enumerations() {
         Cause::OperatorStop,
         Cause::LocalStop,
         Cause::ClockStep,
+        Cause::Fault,
     ];
     let refusals = [
         Refusal::Stopped,
@@ -273,19 +289,30 @@ fn enumerations() {
         Refusal::BadMapping,
         Refusal::Moving,
         Refusal::Diverged,
+        Refusal::NotYours,
     ];
     for (n, state) in states.into_iter().enumerate() {
         let cause = Cause::Requested;
         assert_eq!(
-            RobotControl::State { state, cause }.encode(),
-            [5, n as u8, 0]
+            RobotControl::State {
+                state,
+                cause,
+                changes: 0
+            }
+            .encode(),
+            [5, n as u8, 0, 0]
         );
     }
     for (n, cause) in causes.into_iter().enumerate() {
         let state = RobotState::Idle;
         assert_eq!(
-            RobotControl::State { state, cause }.encode(),
-            [5, 0, n as u8]
+            RobotControl::State {
+                state,
+                cause,
+                changes: 0
+            }
+            .encode(),
+            [5, 0, n as u8, 0]
         );
     }
     for (n, reason) in refusals.into_iter().enumerate() {
@@ -329,11 +356,11 @@ fn greetings() {
 #[test]
 fn must_reject() {
     for (why, control) in [
-        ("no such message", "07"),
+        ("no such message", "08"),
         ("nothing", ""),
-        ("cut", "03"),
-        ("trailing byte", "0400"),
-        ("long form of 3", "03fb0300"),
+        ("cut", "04"),
+        ("trailing byte", "0500"),
+        ("long form of 3", "04fb0300"),
         ("a length of 2^63", "010afdffffffffffffff7f"),
     ] {
         assert!(OperatorControl::decode(&bytes(control)).is_err(), "{why}");

@@ -65,6 +65,7 @@ fn engage() -> impl Strategy<Value = Engage> {
     ];
     (
         any::<u32>(),
+        any::<i64>(),
         drive,
         1e-6..10.0f32,
         unit(),
@@ -72,8 +73,9 @@ fn engage() -> impl Strategy<Value = Engage> {
         any::<u16>(),
     )
         .prop_map(
-            |(engagement, drive, scale, rotation, path_bound_um, lease_ms)| Engage {
+            |(engagement, t_us, drive, scale, rotation, path_bound_um, lease_ms)| Engage {
                 engagement,
+                t_us,
                 drive,
                 scale,
                 rotation,
@@ -92,7 +94,15 @@ fn operator_control() -> impl Strategy<Value = OperatorControl> {
         engage().prop_map(OperatorControl::Engage),
         any::<u32>().prop_map(|engagement| OperatorControl::Release { engagement }),
         Just(OperatorControl::EmergencyStop),
-        Just(OperatorControl::Reset),
+        any::<u32>().prop_map(|changes| OperatorControl::Reset { changes }),
+        (any::<u32>(), state(), any::<u32>(), vec(knot(), 0..40)).prop_map(
+            |(engagement, state, first_knot, knots)| OperatorControl::Path(PathTail {
+                engagement,
+                state,
+                first_knot,
+                knots,
+            })
+        ),
         Just(OperatorControl::Goodbye),
     ]
 }
@@ -119,6 +129,7 @@ fn cause() -> impl Strategy<Value = Cause> {
         Cause::OperatorStop,
         Cause::LocalStop,
         Cause::ClockStep,
+        Cause::Fault,
     ])
 }
 
@@ -134,6 +145,7 @@ fn refusal() -> impl Strategy<Value = Refusal> {
         Refusal::BadMapping,
         Refusal::Moving,
         Refusal::Diverged,
+        Refusal::NotYours,
     ])
 }
 
@@ -174,23 +186,35 @@ fn robot_control() -> impl Strategy<Value = RobotControl> {
             }
         ),
         refusal().prop_map(|reason| RobotControl::Refused { reason }),
-        (robot_state(), cause()).prop_map(|(state, cause)| RobotControl::State { state, cause }),
+        (robot_state(), cause(), any::<u32>()).prop_map(|(state, cause, changes)| {
+            RobotControl::State {
+                state,
+                cause,
+                changes,
+            }
+        }),
     ]
 }
 
 /// As many knots as fit whatever they are; of small ones [`MAX_KNOTS`] do.
 const FITTING_KNOTS: usize = 28;
 
+fn knot() -> impl Strategy<Value = WireKnot> {
+    (any::<u32>(), any::<[i32; 3]>(), any::<[i32; 3]>()).prop_map(|(dt, dx, v)| WireKnot {
+        dt,
+        dx,
+        v,
+    })
+}
+
 fn motion() -> impl Strategy<Value = Motion> {
-    let knot = (any::<u32>(), any::<[i32; 3]>(), any::<[i32; 3]>())
-        .prop_map(|(dt, dx, v)| WireKnot { dt, dx, v });
     (
         any::<[u32; 4]>(),
         any::<[u16; 2]>(),
         params(),
         option::of(any::<u32>()),
         state(),
-        vec(knot, 0..=FITTING_KNOTS),
+        vec(knot(), 0..=FITTING_KNOTS),
     )
         .prop_map(
             |(

@@ -7,7 +7,7 @@ use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 
 use anyhow::{Context, bail};
 use serde::{Deserialize, Serialize};
-use telemime_endpoint::cli::{self, emit};
+use telemime_endpoint::cli::{self, Printer};
 use telemime_endpoint::{Fingerprint, HostClock, Identity, Meter, quic};
 use telemime_sim::arm::LoadOptions;
 use tokio::sync::mpsc;
@@ -185,8 +185,11 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         ..RigOptions::default()
     };
     let rig = Rig::load(&options)?;
-    for notice in rig.arm.notices() {
-        eprintln!("note: {notice}");
+    // Of our own arm there is nothing to tell.
+    if options.urdf.is_some() {
+        for notice in rig.arm.notices() {
+            eprintln!("note: {notice}");
+        }
     }
     let recorder = args
         .record
@@ -208,8 +211,13 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let addr = endpoint.local_addr()?;
     let (rings, handle) = servo::rings();
     let running = servo::thread::Servo::start(rig.servo(rings)).context("no servo thread")?;
-    let (quit, words) = cli::listen(args.follow_stdin)?;
-    let log = Log { json: args.json };
+    let brake = handle.brake.clone();
+    let (quit, words) = cli::listen(args.follow_stdin, move || brake.stop_here())?;
+    let (out, printing) = Printer::start().context("no thread to print from")?;
+    let log = Log {
+        json: args.json,
+        out,
+    };
     log.say(
         &Event::Listening {
             addr,
@@ -237,8 +245,8 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         Some(running.timing.clone()),
     );
     let (notices, heard) = mpsc::unbounded_channel();
-    let listener = tokio::spawn(listen_to(heard, log, recorder));
-    daemon.run(quit, words, notices).await;
+    let listener = tokio::spawn(listen_to(heard, log.clone(), recorder));
+    let served = daemon.run(quit, words, notices).await;
     let recorder = listener.await.context("the log ended early")?;
     let (ticks, mean_ns, p99_ns, overruns) = running.timing.read();
     // The servo outlives everything that could still ask for motion; it ends at rest.
@@ -258,10 +266,12 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
             )
         },
     );
-    match recorder {
-        Some(recorder) => recorder.finish(),
-        None => Ok(()),
+    drop(log);
+    printing.finish();
+    if let Some(recorder) = recorder {
+        recorder.finish()?;
     }
+    Ok(served?)
 }
 
 fn read_config(path: &Path) -> anyhow::Result<File> {
@@ -270,17 +280,18 @@ fn read_config(path: &Path) -> anyhow::Result<File> {
     toml::from_str(&text).map_err(|e| anyhow::anyhow!("{}: {e}", path.display()))
 }
 
-#[derive(Clone, Copy)]
+#[derive(Clone)]
 struct Log {
     json: bool,
+    out: Printer,
 }
 
 impl Log {
-    fn say(self, event: &Event, text: impl FnOnce() -> String) {
+    fn say(&self, event: &Event, text: impl FnOnce() -> String) {
         if self.json {
-            emit(event);
+            self.out.emit(event);
         } else {
-            println!("{}", text());
+            self.out.say(text());
         }
     }
 }

@@ -17,7 +17,7 @@ const DRIFT: f64 = 50e-6;
 /// How fast the applied offset follows the estimate, s per s.
 const SLEW: f64 = 5e-3;
 
-/// A larger difference between estimate and applied offset than this is a step, not drift, s.
+/// What lies this far beyond the bounds of both estimate and applied offset is a step, not drift, s.
 const STEP_S: f64 = 0.05;
 
 #[derive(Debug, Clone, Copy)]
@@ -26,6 +26,9 @@ struct Exchange {
     rtt_s: f64,
     offset_ns: i64,
 }
+
+/// So many exchanges in a row that no jitter explains are a step of a clock.
+const STEP_EXCHANGES: usize = ENOUGH;
 
 /// What applying the estimate did.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,6 +39,15 @@ pub enum Slew {
     Step,
 }
 
+/// The offset in use.
+#[derive(Debug, Clone, Copy)]
+struct Applied {
+    since: Mono,
+    offset_ns: f64,
+    /// How wrong it may be, s.
+    bound_s: f64,
+}
+
 /// Offset of the session clock to the robot's own, with the bound of its error.
 ///
 /// The exchange with the shortest round trip tells the offset best; an older one loses by what the
@@ -44,7 +56,9 @@ pub enum Slew {
 #[derive(Debug, Default)]
 pub struct SessionClock {
     exchanges: VecDeque<Exchange>,
-    applied: Option<(Mono, f64)>,
+    applied: Option<Applied>,
+    /// The newest exchanges that disagree with what is applied by more than the bounds of both.
+    strangers: usize,
 }
 
 impl SessionClock {
@@ -58,35 +72,57 @@ impl SessionClock {
         }
         let offset_ns =
             (t2.0.saturating_sub(t1.0) / 2).saturating_add(t3.0.saturating_sub(t4.0) / 2);
-        if self.exchanges.len() == WINDOW {
-            self.exchanges.pop_front();
-        }
-        self.exchanges.push_back(Exchange {
+        let exchange = Exchange {
             at: t4,
             rtt_s: rtt_ns as f64 * 1e-9,
             offset_ns,
-        });
+        };
+        self.strangers = if self.disagrees(&exchange) {
+            self.strangers + 1
+        } else {
+            0
+        };
+        if self.strangers >= STEP_EXCHANGES {
+            // A short round trip from before the step would outvote everything since for half a minute.
+            let old = self.exchanges.len().saturating_sub(STEP_EXCHANGES - 1);
+            self.exchanges.drain(..old);
+            self.strangers = 0;
+        }
+        if self.exchanges.len() == WINDOW {
+            self.exchanges.pop_front();
+        }
+        self.exchanges.push_back(exchange);
     }
 
     /// Moves the applied offset towards the estimate; at once while `following` is false.
     pub fn slew(&mut self, now: Mono, following: bool) -> Slew {
-        let Some(best) = self.best(now) else {
+        let Some(best) = self.best(now).copied() else {
             return Slew::Smooth;
         };
-        let target_ns = best.offset_ns as f64;
+        let (target_ns, best_s) = (best.offset_ns as f64, badness_s(&best, now));
         match self.applied {
-            Some((since, applied_ns)) if following => {
-                let error_ns = target_ns - applied_ns;
-                let most_ns = SLEW * now.secs_since(since).max(0.0) * 1e9;
-                self.applied = Some((now, applied_ns + error_ns.clamp(-most_ns, most_ns)));
-                if error_ns.abs() > STEP_S * 1e9 {
+            Some(applied) if following => {
+                let error_ns = target_ns - applied.offset_ns;
+                let most_ns = SLEW * now.secs_since(applied.since).max(0.0) * 1e9;
+                let moved_ns = error_ns.clamp(-most_ns, most_ns);
+                self.applied = Some(Applied {
+                    since: now,
+                    offset_ns: applied.offset_ns + moved_ns,
+                    bound_s: best_s + (error_ns - moved_ns).abs() * 1e-9,
+                });
+                // A better estimate may lie anywhere within the worse one's bound; only beyond is a step.
+                if error_ns.abs() * 1e-9 > STEP_S + best_s + applied.bound_s {
                     Slew::Step
                 } else {
                     Slew::Smooth
                 }
             }
             _ => {
-                self.applied = Some((now, target_ns));
+                self.applied = Some(Applied {
+                    since: now,
+                    offset_ns: target_ns,
+                    bound_s: best_s,
+                });
                 Slew::Smooth
             }
         }
@@ -100,13 +136,13 @@ impl SessionClock {
     /// When `stamp` was, or will be, on the robot's clock.
     pub fn to_mono(&self, stamp: Stamp) -> Option<Mono> {
         self.applied
-            .map(|(_, offset_ns)| Mono(stamp.0.saturating_sub(offset_ns.round() as i64)))
+            .map(|a| Mono(stamp.0.saturating_sub(a.offset_ns.round() as i64)))
     }
 
     /// What the session clock shows at `mono`.
     pub fn to_session(&self, mono: Mono) -> Option<Stamp> {
         self.applied
-            .map(|(_, offset_ns)| Stamp(mono.0.saturating_add(offset_ns.round() as i64)))
+            .map(|a| Stamp(mono.0.saturating_add(a.offset_ns.round() as i64)))
     }
 
     /// Bound of the offset's error, s: half the best round trip, and the drift since.
@@ -117,6 +153,14 @@ impl SessionClock {
     /// The shortest round trip seen lately, s.
     pub fn rtt_s(&self) -> Option<f64> {
         self.exchanges.iter().map(|e| e.rtt_s).reduce(f64::min)
+    }
+
+    /// Whether neither the exchange's round trip nor the bound of what is applied explains what it says.
+    fn disagrees(&self, exchange: &Exchange) -> bool {
+        self.applied.is_some_and(|applied| {
+            let error_s = (exchange.offset_ns as f64 - applied.offset_ns).abs() * 1e-9;
+            error_s > STEP_S + exchange.rtt_s / 2.0 + applied.bound_s
+        })
     }
 
     fn best(&self, now: Mono) -> Option<&Exchange> {
@@ -208,5 +252,39 @@ mod tests {
             6,
             "a negative round trip is no exchange"
         );
+    }
+
+    #[test]
+    fn a_step_is_noticed_within_a_second_whatever_the_jitter() {
+        for seed in 0..20 {
+            let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
+            let mut delay = || rng.random_range(90 * MS..110 * MS);
+            let mut clock = SessionClock::default();
+            for i in 0..100 {
+                exchange(&mut clock, i * 250 * MS, 0, delay(), delay());
+                assert_eq!(clock.slew(Mono((i * 250 + 240) * MS), true), Slew::Smooth);
+            }
+            let stepped = (100..).find(|&i| {
+                exchange(&mut clock, i * 250 * MS, 400 * MS, delay(), delay());
+                clock.slew(Mono((i * 250 + 240) * MS), true) == Slew::Step
+            });
+            assert!(
+                stepped.is_some_and(|i| i <= 104),
+                "seed {seed}: {stepped:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_better_estimate_after_a_queue_is_no_step() {
+        let mut clock = SessionClock::default();
+        for i in 0..4 {
+            exchange(&mut clock, i * 20 * MS, 0, 1500 * MS, 100 * MS);
+        }
+        clock.slew(Mono(2000 * MS), false);
+        for i in 8..20 {
+            exchange(&mut clock, i * 250 * MS, 0, 100 * MS, 100 * MS);
+            assert_eq!(clock.slew(Mono((i * 250 + 240) * MS), true), Slew::Smooth);
+        }
     }
 }

@@ -232,7 +232,7 @@ impl Daemon {
     ) -> Option<String> {
         let Greeted {
             connection,
-            mut control,
+            control,
             hello,
         } = greeted;
         let refusal = match negotiate(&hello, v1::VERSION, v1::VERSION) {
@@ -488,9 +488,12 @@ async fn turn_away(connection: Connection, mut control: Control, code: RejectCod
         RejectCode::Malformed => BAD_GREETING,
         _ => REJECTED,
     };
-    // The peer may be gone already; there is nobody else to tell.
-    let _ = control.write(&Answer::Reject { code, text }.encode()).await;
-    let _ = control.send.finish();
-    let _ = tokio::time::timeout(Duration::from_secs(2), control.send.stopped()).await;
+    let say = async {
+        // The peer may be gone already; there is nobody else to tell.
+        let _ = control.write(&Answer::Reject { code, text }.encode()).await;
+        let _ = control.send.finish();
+        let _ = control.send.stopped().await;
+    };
+    let _ = tokio::time::timeout(Duration::from_secs(2), say).await;
     connection.close(VarInt::from_u32(close), b"rejected");
 }

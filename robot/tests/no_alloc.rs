@@ -15,9 +15,15 @@ use telemime_protocol::spline::{BSpline, End};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_robot::rig::{Rig, RigOptions};
-use telemime_robot::servo::{Core, Engagement, Handle, Order, Report, Source, Trajectory, rings};
+use telemime_robot::servo::{
+    Core, Engagement, Handle, Lease, Order, Report, Source, Ticket, Trajectory, rings,
+};
 
 const MS: i64 = 1_000_000;
+
+fn ticket(number: u32) -> Ticket {
+    Ticket { epoch: 1, number }
+}
 
 struct Bench {
     core: Core,
@@ -58,13 +64,28 @@ impl Bench {
         last.unwrap()
     }
 
+    fn lease(&self) -> Lease {
+        Lease {
+            from: self.now,
+            until: self.now.offset_by_secs(0.65),
+        }
+    }
+
+    fn extend(&mut self, number: u32) {
+        let lease = self.lease();
+        self.order(Order::Extend {
+            ticket: ticket(number),
+            lease,
+        });
+    }
+
     fn engage(&mut self, number: u32, source: Source) {
         self.order(Order::Engage(Engagement {
-            number,
+            ticket: ticket(number),
             source,
             scale: 0.1,
             rotation: UnitQuaternion::identity(),
-            lease_s: 0.65,
+            lease: self.lease(),
         }));
     }
 
@@ -117,10 +138,12 @@ fn a_tick_never_touches_the_heap() {
     for i in 0..60 {
         bench.tick(33);
         let (forecast, valid_at) = (bench.forecast(i % 2 == 0), bench.now);
+        let lease = bench.lease();
         bench.order(Order::Track {
+            ticket: ticket(1),
             forecast,
             valid_at,
-            lease_s: 0.65,
+            lease,
         });
     }
     let moving = bench.tick(10);
@@ -134,11 +157,11 @@ fn a_tick_never_touches_the_heap() {
     // A plan to its end, one that takes the place of another, and one that is refused.
     bench.engage(2, trajectory(0.5));
     let mut played = bench.tick(400);
-    bench.order(Order::Extend { lease_s: 0.65 });
+    bench.extend(2);
     bench.engage(3, trajectory(0.5));
     for _ in 0..10 {
         played = bench.tick(100);
-        bench.order(Order::Extend { lease_s: 0.65 });
+        bench.extend(2);
     }
     assert_eq!(
         (played.state, played.cause),
@@ -146,17 +169,21 @@ fn a_tick_never_touches_the_heap() {
     );
     bench.engage(4, trajectory(2.0));
     bench.tick(300);
-    bench.order(Order::Hold(Cause::ClockStep));
+    bench.handle.brake.pull(Cause::ClockStep);
     assert_eq!(bench.tick(700).state, RobotState::Holding);
 
     let (forecast, valid_at) = (bench.forecast(true), bench.now);
     bench.engage(5, Source::Mirror { forecast, valid_at });
     bench.tick(300);
-    bench.order(Order::Release);
+    bench.order(Order::Release(ticket(5)));
     bench.tick(500);
-    bench.order(Order::Stop(Cause::OperatorStop));
+    bench.handle.brake.pull(Cause::OperatorStop);
     bench.tick(10);
-    bench.order(Order::Reset { operator: true });
+    let stop = Some(bench.tick(1).transitions);
+    bench.order(Order::Reset {
+        operator: true,
+        stop,
+    });
     bench.tick(10);
     bench.order(Order::Operator(false));
     assert_eq!(bench.tick(10).state, RobotState::Idle);

@@ -55,6 +55,16 @@ fn widest(truth: &Track) -> (usize, usize) {
     (order[0], order[1])
 }
 
+/// The axis along which the hand travels farthest, to and fro.
+fn busiest(truth: &Track) -> usize {
+    let travel = truth
+        .points()
+        .windows(2)
+        .map(|w| (w[1].1 - w[0].1).abs())
+        .fold(Vector3::zeros(), |sum: Vector3<f64>, step| sum + step);
+    travel.imax()
+}
+
 pub(super) fn load_skill(run: &Run) -> anyhow::Result<Skill> {
     skill_file::load(&run.skill).with_context(|| "the learned skill".to_owned())
 }
@@ -135,7 +145,7 @@ fn path_panel(run: &Run, verdict: &Verdict, (a, b): (usize, usize)) -> Panel {
                 SKY,
                 Shape::Tube(curve, bound_m),
             ),
-            Layer::new("hand", BLACK, Shape::Line(hand)),
+            Layer::new("hand", GREY, Shape::Line(hand)),
             Layer::new(
                 format!("{} checkpoints", verdict.path.len()),
                 ORANGE,
@@ -215,7 +225,7 @@ pub(super) fn mirror(
     );
     let figure = Figure {
         title: format!(
-            "The tip follows {:.0} mm off the hand; without prediction {:.0} mm",
+            "The tip is {:.0} mm off the hand; without prediction it is {:.0} mm",
             verdict.predicted.rmse_m * 1e3,
             verdict.delayed_arm.rmse_m * 1e3
         ),
@@ -230,7 +240,7 @@ pub(super) fn mirror(
             over_time(2),
             path_panel(run, verdict, plane),
             errors,
-            tube_panel(material, &skill, plane.0)?,
+            tube_panel(material, &skill, busiest(&verdict.truth))?,
         ],
     };
     save(args, &figure, "mirror")

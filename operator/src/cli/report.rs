@@ -4,7 +4,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use telemime_endpoint::Mono;
-use telemime_endpoint::cli::emit;
+use telemime_endpoint::cli::Printer;
 use telemime_endpoint::meter::Counts;
 use tokio::sync::mpsc;
 
@@ -238,21 +238,22 @@ impl Event {
 }
 
 /// Where events go.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(super) struct Log {
     pub(super) json: bool,
+    pub(super) out: Printer,
 }
 
 impl Log {
-    pub(super) fn say(self, event: &Event) {
+    pub(super) fn say(&self, event: &Event) {
         if self.json {
-            emit(event);
+            self.out.emit(event);
         } else if let Some(text) = event.text() {
-            println!("{text}");
+            self.out.say(text);
         }
     }
 
-    pub(super) fn note(self, text: &impl ToString) {
+    pub(super) fn note(&self, text: &impl ToString) {
         self.say(&Event::Note {
             text: text.to_string(),
         });

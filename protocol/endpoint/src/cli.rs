@@ -3,7 +3,9 @@
 use std::io::{self, BufRead, IsTerminal, Write};
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::PathBuf;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
+use std::time::Duration;
 
 use serde::Serialize;
 use tokio::signal::unix::{SignalKind, signal};
@@ -55,11 +57,57 @@ pub fn one_line<'a>(
     line.replace('\n', " ")
 }
 
-/// Prints `event` as one line of JSON on stdout. A reader that has gone away is not our concern.
-pub fn emit(event: &impl Serialize) {
-    if let Ok(line) = serde_json::to_string(event) {
-        let mut out = io::stdout().lock();
-        let _ = writeln!(out, "{line}").and_then(|()| out.flush());
+/// Lines a terminal or pipe may leave unread before more are dropped.
+const MAX_UNREAD_LINES: usize = 4096;
+
+/// Prints lines on stdout from a thread of its own, so that a terminal that is stopped, or a pipe that
+/// nobody reads, holds up nothing but the printing.
+#[derive(Debug, Clone)]
+pub struct Printer(SyncSender<String>);
+
+/// The printing thread; to be waited for at the end.
+#[derive(Debug)]
+pub struct Printing(Receiver<()>);
+
+impl Printer {
+    /// Starts printing.
+    ///
+    /// # Errors
+    /// The system's, if it gives no thread.
+    pub fn start() -> io::Result<(Self, Printing)> {
+        let (lines_tx, lines) = sync_channel::<String>(MAX_UNREAD_LINES);
+        let (done, printing) = sync_channel(1);
+        thread::Builder::new()
+            .name("printer".into())
+            .spawn(move || {
+                for line in lines {
+                    let mut out = io::stdout().lock();
+                    // A reader that has gone away is not our concern.
+                    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
+                }
+                let _ = done.send(());
+            })?;
+        Ok((Self(lines_tx), Printing(printing)))
+    }
+
+    /// Prints a line; drops it if too many are unread.
+    pub fn say(&self, line: String) {
+        // A full queue: whoever is to read has stopped reading.
+        let _ = self.0.try_send(line);
+    }
+
+    /// Prints `event` as one line of JSON.
+    pub fn emit(&self, event: &impl Serialize) {
+        if let Ok(line) = serde_json::to_string(event) {
+            self.say(line);
+        }
+    }
+}
+
+impl Printing {
+    /// Waits until everything is printed, but not for a reader that does not read. All printers must be gone.
+    pub fn finish(self) {
+        let _ = self.0.recv_timeout(Duration::from_secs(1));
     }
 }
 
@@ -78,12 +126,13 @@ pub async fn told(quit: &mut watch::Receiver<bool>) {
 }
 
 /// Ctrl-C, SIGTERM, `quit`, or (if asked for) the end of stdin turn the watch true; `stop` and `reset` arrive
-/// as words. stdin is read only when it is a terminal or `follow_stdin` is set.
+/// as words (`stop` is also called at once, on the reading thread). stdin is read only when it is a terminal or `follow_stdin` is set.
 ///
 /// # Errors
 /// The system's, if signals cannot be caught.
 pub fn listen(
     follow_stdin: bool,
+    stop: impl Fn() + Send + 'static,
 ) -> io::Result<(watch::Receiver<bool>, mpsc::UnboundedReceiver<Word>)> {
     let (quit_tx, quit) = watch::channel(false);
     let (word_tx, words) = mpsc::unbounded_channel();
@@ -104,8 +153,13 @@ pub fn listen(
         thread::Builder::new().name("stdin".into()).spawn(move || {
             for line in io::stdin().lock().lines().map_while(Result::ok) {
                 match line.trim() {
-                    "stop" => drop(word_tx.send(Word::Stop)),
-                    "reset" => drop(word_tx.send(Word::Reset)),
+                    "stop" => {
+                        stop();
+                        let _ = word_tx.send(Word::Stop);
+                    }
+                    "reset" => {
+                        let _ = word_tx.send(Word::Reset);
+                    }
                     "quit" => break,
                     _ => eprintln!("stop, reset or quit?"),
                 }

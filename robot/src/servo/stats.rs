@@ -1,9 +1,10 @@
 //! How long ticks take, in a fixed histogram.
 
-const BUCKETS: usize = 512;
-const BUCKET_NS: u32 = 500;
+/// Sixteen buckets an octave: a quantile is right to 6 %.
+const PER_OCTAVE: usize = 16;
+const BUCKETS: usize = 29 * PER_OCTAVE;
 
-/// Tick times in half-microsecond buckets; the last one also holds everything longer.
+/// Tick times in logarithmic buckets from a nanosecond to four seconds.
 #[derive(Debug, Clone)]
 pub struct TickStats {
     buckets: [u32; BUCKETS],
@@ -21,10 +22,29 @@ impl Default for TickStats {
     }
 }
 
+/// The bucket of a time: below 16 ns its own, above by octave and the next four bits.
+fn bucket(ns: u32) -> usize {
+    let octave = (31 - (ns | 1).leading_zeros()) as usize;
+    if octave < 4 {
+        return ns as usize;
+    }
+    (octave - 3) * PER_OCTAVE + (ns >> (octave - 4)) as usize - PER_OCTAVE
+}
+
+/// The first time beyond a bucket.
+fn upper_edge_ns(bucket: usize) -> u32 {
+    if bucket < PER_OCTAVE {
+        return bucket as u32 + 1;
+    }
+    let (octave, sub) = (bucket / PER_OCTAVE + 3, bucket % PER_OCTAVE);
+    let edge = ((PER_OCTAVE + sub + 1) as u64) << (octave - 4);
+    u32::try_from(edge).unwrap_or(u32::MAX)
+}
+
 impl TickStats {
     /// Takes one tick's work.
     pub fn add(&mut self, work_ns: u32) {
-        self.buckets[((work_ns / BUCKET_NS) as usize).min(BUCKETS - 1)] += 1;
+        self.buckets[bucket(work_ns)] += 1;
         self.count += 1;
         self.sum_ns += u64::from(work_ns);
     }
@@ -46,7 +66,7 @@ impl TickStats {
         for (i, &n) in self.buckets.iter().enumerate() {
             seen += u64::from(n);
             if seen >= rank && seen > 0 {
-                return (i as u32 + 1) * BUCKET_NS;
+                return upper_edge_ns(i);
             }
         }
         0
@@ -58,15 +78,28 @@ mod tests {
     use super::*;
 
     #[test]
-    fn quantiles_are_upper_edges() {
+    fn buckets_cover_every_time_without_a_gap() {
+        assert_eq!(bucket(u32::MAX), BUCKETS - 1);
+        for i in 0..BUCKETS - 1 {
+            let edge = upper_edge_ns(i);
+            assert_eq!((bucket(edge - 1), bucket(edge)), (i, i + 1), "{i}");
+        }
+    }
+
+    #[test]
+    fn quantiles_are_upper_edges_however_long_a_tick_takes() {
         let mut stats = TickStats::default();
         assert_eq!((stats.mean_ns(), stats.quantile_ns(0.99)), (0, 0));
         (0..98).for_each(|_| stats.add(5_100));
         stats.add(40_000);
         stats.add(9_000_000);
-        assert_eq!(stats.quantile_ns(0.5), 5_500);
-        assert_eq!(stats.quantile_ns(0.99), 40_500);
-        assert_eq!(stats.quantile_ns(1.0), 256_000);
+        let near = |p: f64, ns: f64| {
+            let ratio = f64::from(stats.quantile_ns(p)) / ns;
+            assert!((1.0..=1.07).contains(&ratio), "{p}: {ratio}");
+        };
+        near(0.5, 5_100.0);
+        near(0.99, 40_000.0);
+        near(1.0, 9_000_000.0);
         assert_eq!(stats.mean_ns(), (98 * 5_100 + 40_000 + 9_000_000) / 100);
     }
 }

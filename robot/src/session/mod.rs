@@ -345,8 +345,6 @@ impl Session {
         match report.state {
             RobotState::Stopped => return Err(Refusal::Stopped),
             RobotState::Engaged | RobotState::Coasting => return Err(Refusal::AlreadyEngaged),
-            // What was granted a moment ago is not in a report yet.
-            _ if self.acknowledged != self.engagement => return Err(Refusal::AlreadyEngaged),
             RobotState::Idle | RobotState::Ready | RobotState::Holding => {}
         }
         if report.moving {
@@ -354,6 +352,10 @@ impl Session {
         }
         if engage.engagement <= self.engagement {
             return Err(Refusal::OldEngagement);
+        }
+        // What was granted a moment ago is not in a report yet.
+        if self.acknowledged != self.engagement {
+            return Err(Refusal::AlreadyEngaged);
         }
         let [w, x, y, z] = engage.rotation.map(f64::from);
         let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));

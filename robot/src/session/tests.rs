@@ -37,6 +37,7 @@ struct Bench {
     control: Vec<RobotControl>,
     datagrams: Vec<RobotDatagram>,
     orders: Vec<Order>,
+    brakes: Vec<Cause>,
     goodbyes: u32,
 }
 
@@ -61,9 +62,9 @@ fn report(state: RobotState) -> Report {
         state,
         cause: Cause::Requested,
         transitions: state as u32,
-        engagement: 0,
+        engagement: Ticket::default(),
         engaged_at: Mono(0),
-        declined: (0, Mono(i64::MIN)),
+        declined: Ticket::default(),
         mapping: Mapping {
             scale: 0.1,
             rotation: UnitQuaternion::identity(),
@@ -96,6 +97,7 @@ impl Bench {
             control: Vec::new(),
             datagrams: Vec::new(),
             orders: Vec::new(),
+            brakes: Vec::new(),
             goodbyes: 0,
         };
         bench.drain();
@@ -153,6 +155,7 @@ impl Bench {
                     self.datagrams.push(RobotDatagram::decode(&bytes).unwrap());
                 }
                 Output::Order(order) => self.orders.push(order),
+                Output::Brake(cause) => self.brakes.push(cause),
                 Output::Goodbye => self.goodbyes += 1,
             }
         }
@@ -163,6 +166,7 @@ impl Bench {
         self.control.clear();
         self.datagrams.clear();
         self.orders.clear();
+        self.brakes.clear();
     }
 
     fn control(&mut self, message: &OperatorControl) {
@@ -188,7 +192,7 @@ impl Bench {
     /// A tick's report, in this state and of the engagement asked for last.
     fn reports(&mut self, state: RobotState) {
         let engaged = Report {
-            engagement: self.session.engagement,
+            engagement: self.session.ticket(),
             engaged_at: self.now,
             at: self.now,
             ..report(state)
@@ -205,6 +209,7 @@ impl Bench {
     fn mirror(&self, engagement: u32) -> Engage {
         Engage {
             engagement,
+            t_us: self.stamp(0).0 / 1000,
             drive: Drive::Mirror {
                 state: WireState::quantise(&HandState::first(self.stamp(0), hand())).unwrap(),
                 model: 0,
@@ -266,8 +271,8 @@ impl Bench {
     /// The leases of the tracks ordered so far, ms.
     fn leases_ms(&self) -> Vec<i64> {
         let lease = |o: &Order| match o {
-            Order::Track { lease_s, .. } | Order::Extend { lease_s } => {
-                Some((lease_s * 1e3).round() as i64)
+            Order::Track { lease, .. } | Order::Extend { lease, .. } => {
+                Some((lease.until.secs_since(lease.from) * 1e3).round() as i64)
             }
             _ => None,
         };

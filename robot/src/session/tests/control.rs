@@ -42,7 +42,8 @@ fn an_engagement_is_acknowledged_once_when_the_servo_reports_it() {
     let [Order::Engage(engagement)] = &bench.orders[..] else {
         panic!("{:?}", bench.orders)
     };
-    assert_eq!((engagement.number, engagement.lease_s), (1, 0.65));
+    let lease_s = engagement.lease.until.secs_since(engagement.lease.from);
+    assert_eq!((engagement.ticket, lease_s), (bench.session.ticket(), 0.65));
     assert!((engagement.scale - 0.1).abs() < 1e-7);
     assert_eq!(bench.control, [], "nothing is promised before it is done");
     bench.forget();
@@ -61,6 +62,7 @@ fn an_engagement_is_acknowledged_once_when_the_servo_reports_it() {
         RobotControl::State {
             state: RobotState::Engaged,
             cause: Cause::Requested,
+            changes: RobotState::Engaged as u32,
         },
     ];
     assert_eq!(bench.control, expected);
@@ -70,8 +72,10 @@ fn an_engagement_is_acknowledged_once_when_the_servo_reports_it() {
 fn another_sessions_engagement_of_the_same_number_is_no_acknowledgement() {
     let mut bench = Bench::ready(None);
     let former = Report {
-        engagement: 1,
-        engaged_at: Mono(bench.now.0 - 5000 * MS),
+        engagement: Ticket {
+            epoch: EPOCH - 1,
+            number: 1,
+        },
         ..report(RobotState::Holding)
     };
     bench.report(&former);
@@ -93,15 +97,15 @@ fn an_engage_the_servo_declines_is_answered() {
     let engage = bench.mirror(1);
     bench.engage(&engage);
     bench.forget();
-    let declined = |at| Report {
-        declined: (1, at),
+    let declined = |epoch| Report {
+        declined: Ticket { epoch, number: 1 },
         moving: true,
         ..report(RobotState::Ready)
     };
-    bench.report(&declined(Mono(bench.now.0 - 5000 * MS)));
+    bench.report(&declined(EPOCH - 1));
     assert_eq!(bench.control, [], "another session's");
-    bench.report(&declined(bench.now));
-    bench.report(&declined(bench.now));
+    bench.report(&declined(EPOCH));
+    bench.report(&declined(EPOCH));
     let reason = Refusal::Moving;
     assert_eq!(bench.control, [RobotControl::Refused { reason }]);
 }
@@ -149,6 +153,8 @@ fn an_engagement_is_never_repeated() {
         let engage = bench.mirror(number);
         assert_eq!(bench.refusal(&engage), Some(Refusal::OldEngagement));
     }
+    bench.reports(RobotState::Engaged);
+    bench.reports(RobotState::Ready);
     let engage = bench.mirror(4);
     assert_eq!(bench.refusal(&engage), None);
 }
@@ -286,33 +292,92 @@ fn a_plan_is_played_from_its_beginning() {
 fn a_stop_is_ordered_and_confirmed_even_on_top_of_a_stop() {
     let mut bench = Bench::mirroring(None);
     bench.control(&OperatorControl::EmergencyStop);
-    assert!(matches!(
-        bench.orders[..],
-        [Order::Stop(Cause::OperatorStop)]
-    ));
+    assert_eq!(bench.brakes, [Cause::OperatorStop]);
     assert_eq!(bench.control, [], "confirmed by the servo, not by us");
     let stopped = Report {
         cause: Cause::OperatorStop,
+        transitions: 9,
         ..report(RobotState::Stopped)
     };
     bench.report(&stopped);
     let confirmation = RobotControl::State {
         state: RobotState::Stopped,
         cause: Cause::OperatorStop,
+        changes: 9,
     };
     assert_eq!(bench.control, std::slice::from_ref(&confirmation));
     bench.forget();
 
     bench.control(&OperatorControl::EmergencyStop);
     assert_eq!(bench.control, [confirmation]);
-    bench.control(&OperatorControl::Reset);
-    assert!(matches!(
-        bench.orders[..],
-        [
-            Order::Stop(Cause::OperatorStop),
-            Order::Reset { operator: true }
-        ]
-    ));
+}
+
+#[test]
+fn a_reset_leaves_the_stop_it_means_and_never_a_local_one() {
+    let mut bench = Bench::ready(None);
+    bench.control(&OperatorControl::Reset { changes: 9 });
+    assert!(
+        bench.orders.is_empty() && bench.control.is_empty(),
+        "nothing is stopped"
+    );
+    for (cause, changes, granted) in [
+        (Cause::OperatorStop, 8, false),
+        (Cause::LocalStop, 9, false),
+        (Cause::OperatorStop, 9, true),
+    ] {
+        bench.report(&Report {
+            cause,
+            transitions: 9,
+            ..report(RobotState::Stopped)
+        });
+        bench.forget();
+        bench.control(&OperatorControl::Reset { changes });
+        let ordered = matches!(
+            bench.orders[..],
+            [Order::Reset {
+                operator: true,
+                stop: Some(9)
+            }]
+        );
+        let refused = bench.refusals() == [Refusal::NotYours];
+        assert_eq!(
+            (ordered, refused),
+            (granted, !granted),
+            "{cause:?} {changes}"
+        );
+    }
+}
+
+#[test]
+fn an_old_request_is_not_meant_any_more() {
+    let mut bench = Bench::ready(None);
+    let engage = bench.mirror(1);
+    let old = Engage {
+        t_us: bench.stamp(501).0 / 1000,
+        ..engage.clone()
+    };
+    assert_eq!(bench.refusal(&old), Some(Refusal::StaleReference));
+    let late = Engage {
+        t_us: bench.stamp(300).0 / 1000,
+        ..engage
+    };
+    assert_eq!(bench.refusal(&late), None);
+    let [Order::Engage(engagement)] = &bench.orders[..] else {
+        panic!("{:?}", bench.orders)
+    };
+    let lease_s = engagement.lease.until.secs_since(bench.now);
+    assert!(
+        (lease_s - 0.35).abs() < 1e-3,
+        "the lease counts from the request: {lease_s}"
+    );
+}
+
+#[test]
+fn one_request_at_a_time() {
+    let mut bench = Bench::ready(None);
+    let (first, second) = (bench.mirror(1), bench.mirror(2));
+    assert_eq!(bench.refusal(&first), None);
+    assert_eq!(bench.refusal(&second), Some(Refusal::AlreadyEngaged));
 }
 
 #[test]
@@ -322,7 +387,7 @@ fn only_the_present_engagement_is_released() {
     bench.control(&OperatorControl::Release { engagement: 0 });
     assert!(bench.orders.is_empty());
     bench.control(&OperatorControl::Release { engagement: 1 });
-    assert!(matches!(bench.orders[..], [Order::Release]));
+    assert!(matches!(bench.orders[..], [Order::Release(_)]));
 }
 
 #[test]
@@ -338,11 +403,11 @@ fn the_end_of_a_session_takes_authority_away() {
 #[test]
 fn an_unknown_message_ends_the_session_unless_it_may_be_ignored() {
     let mut bench = Bench::ready(None);
-    for payload in [vec![], vec![250], vec![4, 0]] {
+    for payload in [vec![], vec![250], vec![5, 0]] {
         assert_eq!(bench.frame(payload.clone(), true), Ok(()));
         assert!(bench.frame(payload, false).is_err());
     }
     assert!(bench.orders.is_empty() && bench.control.is_empty());
-    assert_eq!(bench.frame(OperatorControl::Reset.encode(), true), Ok(()));
-    assert_eq!(bench.orders.len(), 1, "ignorable does not mean ignored");
+    assert_eq!(bench.frame(OperatorControl::Goodbye.encode(), true), Ok(()));
+    assert_eq!(bench.goodbyes, 1, "ignorable does not mean ignored");
 }

@@ -235,10 +235,7 @@ fn goes_extend_the_lease_in_order_and_within_time() {
 fn a_stop_datagram_stops_at_once() {
     let mut bench = Bench::mirroring(None);
     bench.datagram(&OperatorDatagram::Stop { epoch: EPOCH });
-    assert!(matches!(
-        bench.orders[..],
-        [Order::Stop(Cause::OperatorStop)]
-    ));
+    assert_eq!(bench.brakes, [Cause::OperatorStop]);
 }
 
 #[test]
@@ -257,7 +254,7 @@ fn a_step_of_the_session_clock_is_a_hold_while_following_and_nothing_before() {
     bench.exchange(20 * MS, 90);
     assert!(bench.orders.is_empty(), "drift is followed smoothly");
     bench.exchange(step, 60);
-    assert!(matches!(bench.orders[..], [Order::Hold(Cause::ClockStep)]));
+    assert_eq!(bench.brakes, [Cause::ClockStep]);
 }
 
 #[test]
