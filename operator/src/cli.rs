@@ -1,5 +1,6 @@
 //! The operator daemon's command line: flags over a TOML file over defaults.
 
+mod played;
 mod report;
 mod skills;
 
@@ -18,6 +19,7 @@ use tokio::sync::mpsc;
 use crate::daemon::Daemon;
 use crate::session::{FutureBound, SessionConfig};
 use crate::task::{Outcome, Recording, Task};
+use played::Played;
 pub use report::{Event, PlayReport, Scores};
 pub use skills::{Skills, infer};
 
@@ -308,10 +310,7 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     };
     let peer: Fingerprint = peer.parse()?;
     let skills = Skills::gather(&args, &log)?;
-    let (mut task, play) = make_task(&args, &skills)?;
-    if let Some(play) = play {
-        log.say(&Event::Plan(play));
-    }
+    let (mut task, played) = make_task(&args, &skills, config.rotation, &log)?;
 
     let (quit, words) = cli::listen(args.follow_stdin, || {})?;
     let meter = Meter::default();
@@ -336,11 +335,20 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     let (notices, heard) = mpsc::unbounded_channel();
     let epoch = daemon.epoch;
     let progress = std::io::stderr().is_terminal() && !args.json;
-    let listener = tokio::spawn(report::listen_to(heard, log.clone(), epoch, progress));
+    let listener = tokio::spawn(report::listen_to(
+        heard,
+        log.clone(),
+        epoch,
+        progress,
+        played,
+    ));
     let done = daemon.run(&mut task, quit, words, &notices).await;
     drop(notices);
-    listener.await.context("the log ended early")?;
+    let played = listener.await.context("the log ended early")?;
     let summary = done?;
+    if let Some(scores) = played.and_then(|played| played.scores()) {
+        log.say(&scores);
+    }
     log.say(&Event::done(&summary, &task, epoch));
     drop(log);
     printing.finish();
@@ -350,7 +358,12 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     }
 }
 
-fn make_task(args: &Args, skills: &Skills) -> anyhow::Result<(Task, Option<PlayReport>)> {
+fn make_task(
+    args: &Args,
+    skills: &Skills,
+    rotation: UnitQuaternion<f64>,
+    log: &report::Log,
+) -> anyhow::Result<(Task, Option<Played>)> {
     match (&args.replay, &args.play) {
         (Some(path), None) => {
             let recording = skills.unseen(path)?;
@@ -366,7 +379,9 @@ fn make_task(args: &Args, skills: &Skills) -> anyhow::Result<(Task, Option<PlayR
             let skill = skills.named(name)?;
             let bound_m = args.bound.unwrap_or(0.01 * skill.stats().reach_m);
             let (plan, report) = infer(&skill, bound_m)?;
-            Ok((Task::play(plan), Some(report)))
+            log.say(&Event::Plan(report));
+            let played = Played::new(plan.spline()?, skills.aligned(name), rotation);
+            Ok((Task::play(plan), Some(played)))
         }
         _ => bail!("what to do? Give --replay FILE or --play SKILL"),
     }

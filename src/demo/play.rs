@@ -78,7 +78,7 @@ pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Res
             .iter()
             .map(|path| Scores::of(path, &estimate))
             .collect();
-        mean(&each)
+        Scores::mean(&each)
     };
     let (tick_mean_us, tick_p99_us, _) = servo(run);
     let result = Result {
@@ -162,16 +162,6 @@ pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Res
 
 fn pairs(t: &[f64], x: &[Vector3<f64>], d: usize) -> Vec<(f64, f64)> {
     t.iter().zip(x).map(|(t, x)| (*t, x[d])).collect()
-}
-
-fn mean(each: &[Scores]) -> Scores {
-    let n = each.len().max(1) as f64;
-    Scores {
-        mae_m: each.iter().map(|s| s.mae_m).sum::<f64>() / n,
-        mse_m2: each.iter().map(|s| s.mse_m2).sum::<f64>() / n,
-        r2: each.iter().map(|s| s.r2).sum::<f64>() / n,
-        max_m: each.iter().map(|s| s.max_m).fold(0.0, f64::max),
-    }
 }
 
 fn table(r: &Result) -> String {

@@ -8,6 +8,7 @@ use telemime_endpoint::cli::Printer;
 use telemime_endpoint::meter::Counts;
 use tokio::sync::mpsc;
 
+use super::played::Played;
 use crate::daemon::{Notice, Summary};
 use crate::session;
 use crate::task::{Outcome, Task};
@@ -26,6 +27,17 @@ pub struct Scores {
 }
 
 impl Scores {
+    /// The mean of several; the largest distance is the largest of all.
+    pub fn mean(each: &[Self]) -> Self {
+        let n = each.len().max(1) as f64;
+        Self {
+            mae_m: each.iter().map(|s| s.mae_m).sum::<f64>() / n,
+            mse_m2: each.iter().map(|s| s.mse_m2).sum::<f64>() / n,
+            r2: each.iter().map(|s| s.r2).sum::<f64>() / n,
+            max_m: each.iter().map(|s| s.max_m).fold(0.0, f64::max),
+        }
+    }
+
     /// Of `estimate` against `truth`, sample by sample; both have the same length.
     pub fn of(truth: &[Vector3<f64>], estimate: &[Vector3<f64>]) -> Self {
         let n = truth.len().max(1) as f64;
@@ -132,6 +144,11 @@ pub enum Event {
         received: u32,
         dropped: u32,
     },
+    Played {
+        samples: usize,
+        rebuilt_to_tip: Scores,
+        demonstrations_to_tip: Option<Scores>,
+    },
     Done {
         completed: bool,
         why: Option<String>,
@@ -218,9 +235,36 @@ impl Event {
                 )
             }
             Self::Engaged { engagement, .. } => format!("engaged #{engagement}"),
+            // It passes within a few exchanges, and is asked again.
+            Self::Refused { reason } if reason == "ClockUnknown" => return None,
             Self::Refused { reason } => format!("the robot declines: {reason}"),
             Self::State { state, cause, .. } => format!("robot: {state} ({cause})"),
             Self::Progress { .. } | Self::Telemetry { .. } => return None,
+            Self::Played {
+                samples,
+                rebuilt_to_tip,
+                demonstrations_to_tip,
+            } => {
+                let line = |s: &Scores| {
+                    format!(
+                        "R² {:.5}, MAE {:.2} mm, MSE {:.2} mm²",
+                        s.r2,
+                        s.mae_m * 1e3,
+                        s.mse_m2 * 1e6
+                    )
+                };
+                let mut text = format!(
+                    "tip against the rebuilt motion, by {samples} telemetry samples: {}",
+                    line(rebuilt_to_tip)
+                );
+                if let Some(scores) = demonstrations_to_tip {
+                    text.push_str(&format!(
+                        "; against the aligned demonstrations: {}",
+                        line(scores)
+                    ));
+                }
+                text
+            }
             Self::Done {
                 samples,
                 messages,
@@ -266,7 +310,8 @@ pub(super) async fn listen_to(
     log: Log,
     epoch: Mono,
     progress: bool,
-) {
+    mut played: Option<Played>,
+) -> Option<Played> {
     let bar = if progress {
         ProgressBar::new(1000)
     } else {
@@ -276,6 +321,13 @@ pub(super) async fn listen_to(
         bar.set_style(style);
     }
     while let Some(notice) = heard.recv().await {
+        if let Some(played) = &mut played {
+            match &notice {
+                Notice::Mapping { scale, .. } => played.mapped(*scale),
+                Notice::Event(_, event) => played.hear(event),
+                _ => {}
+            }
+        }
         let event = match notice {
             Notice::Dialling { why } => Event::Dialling { why },
             Notice::Connected { epoch } => Event::Connected { epoch },
@@ -328,4 +380,5 @@ pub(super) async fn listen_to(
         bar.suspend(|| log.say(&event));
     }
     bar.finish_and_clear();
+    played
 }

@@ -12,6 +12,7 @@ use telemime_protocol::wire::codec;
 use super::Args;
 use super::report::{Event, Log, PlayReport, Scores};
 use crate::demonstration::{Demonstration, Demonstrations};
+use crate::learn::align::{Aligned, align};
 use crate::learn::{LearnOptions, Progress, learn_skill};
 use crate::skill_file;
 
@@ -25,6 +26,8 @@ const SAMPLE_S: f64 = 0.02;
 #[derive(Debug)]
 pub struct Skills {
     all: Vec<Arc<Skill>>,
+    /// What was learned just now was learned from these, by name.
+    aligned: Vec<(String, Aligned)>,
     mirror: Option<Arc<Skill>>,
 }
 
@@ -32,6 +35,7 @@ impl Skills {
     pub(super) fn gather(args: &Args, log: &Log) -> anyhow::Result<Self> {
         let mut skills = Self {
             all: Vec::new(),
+            aligned: Vec::new(),
             mirror: None,
         };
         let mut pooled: Vec<Demonstration> = Vec::new();
@@ -55,6 +59,9 @@ impl Skills {
                     .with_context(|| format!("cannot make {}", folder.display()))?;
                 skill_file::save(&skill, folder.join(format!("{}.skill", skill.name())))?;
             }
+            skills
+                .aligned
+                .push((skill.name().to_owned(), align(&kept)?));
             skills.push(Arc::new(skill))?;
             pooled.extend(kept);
         }
@@ -98,6 +105,12 @@ impl Skills {
     /// The model to mirror with, if there is any.
     pub fn mirror(&self) -> Option<Arc<Skill>> {
         self.mirror.clone()
+    }
+
+    /// The demonstrations a skill was learned from just now, on one time axis.
+    pub(super) fn aligned(&self, name: &str) -> Option<Aligned> {
+        let found = self.aligned.iter().find(|(known, _)| known == name);
+        found.map(|(_, aligned)| aligned.clone())
     }
 
     /// The skill of this name.

@@ -110,6 +110,8 @@ pub enum Event {
     Engaged {
         /// Which engagement.
         engagement: u32,
+        /// When, µs on the session clock as the robot estimates it.
+        t_us: i64,
         /// The hand position that corresponds to `tip_m`, m.
         hand_m: [f32; 3],
         /// The tip at that instant, m.
@@ -299,13 +301,14 @@ impl Session {
             }
             RobotControl::Engaged {
                 engagement,
+                t_us,
                 hand_m,
                 tip_m,
-                ..
             } => {
                 self.before = None;
                 self.events.push_back(Event::Engaged {
                     engagement,
+                    t_us,
                     hand_m,
                     tip_m,
                 });

@@ -93,6 +93,7 @@ fn after_a_hold_or_a_stop_nothing_is_asked_again() {
         assert_eq!(task.phase, Phase::Asked);
         let engaged = Event::Engaged {
             engagement: 1,
+            t_us: 0,
             hand_m: [0.0; 3],
             tip_m: [0.0; 3],
         };

@@ -1,0 +1,192 @@
+//! What became of a played skill: where the tip was, by the robot's telemetry, against where it was sent.
+
+use nalgebra::{UnitQuaternion, Vector3};
+use telemime_protocol::spline::BSpline;
+use telemime_protocol::wire::v1::{RobotState, Telemetry};
+
+use super::report::{Event, Scores};
+use crate::learn::align::Aligned;
+use crate::session;
+
+/// A skill being played, and the tip as heard of.
+pub(super) struct Played {
+    spline: BSpline<3>,
+    demonstrations: Option<Aligned>,
+    rotation: UnitQuaternion<f64>,
+    scale: f64,
+    engaged: Option<Engaged>,
+    /// Time since the engage (s) and the tip mapped back to the hand (m).
+    tip: Vec<(f64, Vector3<f64>)>,
+}
+
+struct Engaged {
+    number: u32,
+    t_us: i64,
+    hand_m: Vector3<f64>,
+    tip_m: Vector3<f64>,
+}
+
+impl Played {
+    pub(super) fn new(
+        spline: BSpline<3>,
+        demonstrations: Option<Aligned>,
+        rotation: UnitQuaternion<f64>,
+    ) -> Self {
+        Self {
+            spline,
+            demonstrations,
+            rotation,
+            scale: 1.0,
+            engaged: None,
+            tip: Vec::new(),
+        }
+    }
+
+    /// The scale the engagement will use.
+    pub(super) fn mapped(&mut self, scale: f64) {
+        self.scale = scale;
+    }
+
+    pub(super) fn hear(&mut self, event: &session::Event) {
+        let metres = |x: &[f32; 3]| Vector3::from(*x).cast::<f64>();
+        match event {
+            session::Event::Engaged {
+                engagement,
+                t_us,
+                hand_m,
+                tip_m,
+            } => {
+                self.engaged = Some(Engaged {
+                    number: *engagement,
+                    t_us: *t_us,
+                    hand_m: metres(hand_m),
+                    tip_m: metres(tip_m),
+                });
+            }
+            session::Event::Telemetry(telemetry) => self.take(telemetry),
+            _ => {}
+        }
+    }
+
+    fn take(&mut self, telemetry: &Telemetry) {
+        let Some(engaged) = &self.engaged else { return };
+        let following = matches!(telemetry.state, RobotState::Engaged | RobotState::Coasting);
+        let t_s = (telemetry.t_us - engaged.t_us) as f64 * 1e-6;
+        let newer = self.tip.last().is_none_or(|(last_s, _)| t_s > *last_s);
+        if following && newer && t_s >= 0.0 && telemetry.engagement == engaged.number {
+            let tip_m = Vector3::from(telemetry.tip_m).cast::<f64>();
+            let moved = self.rotation.inverse() * (tip_m - engaged.tip_m) / self.scale;
+            self.tip.push((t_s, engaged.hand_m + moved));
+        }
+    }
+
+    /// The scores, if the robot was heard of while it played.
+    pub(super) fn scores(&self) -> Option<Event> {
+        let (start_s, end_s) = self.spline.span_s();
+        let (sent, followed): (Vec<_>, Vec<_>) = self
+            .tip
+            .iter()
+            .filter_map(|(t_s, tip)| Some((self.spline.eval(*t_s).ok()?.x, *tip)))
+            .unzip();
+        if sent.len() < 2 {
+            return None;
+        }
+        let demonstrations = self.demonstrations.as_ref().map(|aligned| {
+            let estimate: Vec<_> = aligned
+                .times_s
+                .iter()
+                .map(|t_s| self.tip_at(t_s.clamp(start_s, end_s)))
+                .collect();
+            let each: Vec<_> = aligned
+                .paths
+                .iter()
+                .map(|path| Scores::of(path, &estimate))
+                .collect();
+            Scores::mean(&each)
+        });
+        Some(Event::Played {
+            samples: sent.len(),
+            rebuilt_to_tip: Scores::of(&sent, &followed),
+            demonstrations_to_tip: demonstrations,
+        })
+    }
+
+    /// Linear between what was heard.
+    fn tip_at(&self, t_s: f64) -> Vector3<f64> {
+        let after = self.tip.partition_point(|(t, _)| *t <= t_s);
+        let before = self.tip[after.saturating_sub(1)];
+        match self.tip.get(after) {
+            Some(next) if next.0 > before.0 => {
+                let u = ((t_s - before.0) / (next.0 - before.0)).clamp(0.0, 1.0);
+                before.1.lerp(&next.1, u)
+            }
+            _ => before.1,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use telemime_protocol::spline::End;
+
+    #[test]
+    fn a_tip_that_does_as_it_is_told_scores_one() {
+        let t = [0.0, 0.5, 1.0];
+        let x = [
+            Vector3::new(0.1, 0.0, 2.0),
+            Vector3::new(0.4, 0.3, 2.2),
+            Vector3::new(0.2, 0.5, 2.1),
+        ];
+        let spline = BSpline::<3>::interpolate(&t, &x, End::Natural).unwrap();
+        let rotation = UnitQuaternion::from_euler_angles(0.1, 0.2, 0.3);
+        let mut played = Played::new(spline.clone(), None, rotation);
+        assert_eq!(played.scores(), None);
+        played.mapped(0.25);
+        played.hear(&session::Event::Engaged {
+            engagement: 3,
+            t_us: 1_000_000,
+            hand_m: [0.1, 0.0, 2.0],
+            tip_m: [0.5, 0.0, 0.4],
+        });
+        for i in 0..=20 {
+            let t_s = f64::from(i) * 0.05;
+            let hand = spline.eval(t_s).unwrap().x - x[0];
+            let tip = Vector3::new(0.5, 0.0, 0.4) + rotation * hand * 0.25;
+            let telemetry = Telemetry {
+                epoch: 1,
+                seq: i as u32,
+                state: RobotState::Engaged,
+                engagement: 3,
+                t_us: 1_000_000 + i64::from(i) * 50_000,
+                clock_uncertainty_us: 0,
+                age_ms: 0,
+                delay_ms: 0,
+                path_frontier: 0,
+                received: 0,
+                newest_seq: 0,
+                dropped: 0,
+                clamps: 0,
+                tick_mean_ns: 0,
+                tick_p99_ns: 0,
+                overruns: 0,
+                tip_m: tip.cast::<f32>().into(),
+                q: Vec::new(),
+            };
+            played.hear(&session::Event::Telemetry(Box::new(telemetry)));
+        }
+        let Some(Event::Played {
+            samples,
+            rebuilt_to_tip,
+            ..
+        }) = played.scores()
+        else {
+            panic!("no scores")
+        };
+        assert_eq!(samples, 21);
+        assert!(
+            rebuilt_to_tip.r2 > 0.999_999 && rebuilt_to_tip.max_m < 1e-5,
+            "{rebuilt_to_tip:?}"
+        );
+    }
+}
