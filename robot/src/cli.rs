@@ -133,7 +133,7 @@ pub enum Event {
         tip_m: [f64; 3],
     },
     Path {
-        knots: Vec<(f64, [f64; 3], [f64; 3])>,
+        knots: Vec<(f64, [f64; 3], [f64; 3], bool)>,
     },
     Servo {
         ticks: u64,
@@ -399,11 +399,11 @@ impl Recorder {
         let (queue, reports) = sync_channel::<Report>(QUEUE);
         let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
             let mut out = std::io::BufWriter::new(file);
-            write!(out, "mono_ns,state,engagement,age_s,clamps,tip_x,tip_y,tip_z,target_x,target_y,target_z")?;
+            write!(out, "tick,mono_ns,state,engagement,age_s,clamps,tip_x,tip_y,tip_z,target_x,target_y,target_z")?;
             (0..dof).try_for_each(|i| write!(out, ",q{i}"))?;
             writeln!(out)?;
             for r in reports {
-                write!(out, "{},{:?},{},{:.6},{}", r.at.0, r.state, r.engagement.number, r.age_s, r.clamps)?;
+                write!(out, "{},{},{:?},{},{:.6},{}", r.tick, r.at.0, r.state, r.engagement.number, r.age_s, r.clamps)?;
                 r.tip_m.iter().chain(&r.target_m).try_for_each(|v| write!(out, ",{v:.6}"))?;
                 r.q.iter().take(dof).try_for_each(|v| write!(out, ",{v:.6}"))?;
                 writeln!(out)?;

@@ -88,8 +88,9 @@ pub enum Notice {
     },
     /// A servo tick, for recording.
     Report(Box<Report>),
-    /// The path an engagement received, as it stands when the session ends: time (s, session clock), m, m/s.
-    Path(Vec<(f64, [f64; 3], [f64; 3])>),
+    /// The path an engagement received, as it stands when the session ends: time (s, session clock), m, m/s, and
+    /// whether it starts afresh there, not joined to the knot before.
+    Path(Vec<(f64, [f64; 3], [f64; 3], bool)>),
 }
 
 struct Greeted {
@@ -387,10 +388,9 @@ impl Daemon {
             *skill = Some(held);
         }
         if let Some(mirror) = ended.mirror() {
-            let knot = |k: &telemime_protocol::checkpoint::path::DecodedKnot| {
-                (k.t.as_secs_f64(), k.x.into(), k.v.into())
-            };
-            let _ = notices.send(Notice::Path(mirror.path().knots().map(knot).collect()));
+            let knots = mirror.path().marked();
+            let knots = knots.map(|(k, start)| (k.t.as_secs_f64(), k.x.into(), k.v.into(), start));
+            let _ = notices.send(Notice::Path(knots.collect()));
         }
         let now = self.clock.now();
         let clock = ended.clock();

@@ -9,9 +9,8 @@ use telemime_operator::demonstration::Demonstrations;
 use telemime_operator::learn::align::align;
 use telemime_operator::skill_file;
 use telemime_protocol::skill::{Gmr, Skill};
-use telemime_protocol::spline::HermiteSpan;
 
-use super::judge::Verdict;
+use super::judge::{Verdict, joined};
 use super::processes::Run;
 use super::{Args, Material};
 use crate::figure::{
@@ -113,9 +112,10 @@ fn path_panel(run: &Run, verdict: &Verdict, (a, b): (usize, usize)) -> Panel {
     let flat = |x: &Vector3<f64>| (x[a], x[b]);
     let mut curve = Vec::new();
     for pair in verdict.path.windows(2) {
-        let span_s = pair[1].t.secs_since(pair[0].t);
-        let span = HermiteSpan::new(span_s, [pair[0].x, pair[0].v], [pair[1].x, pair[1].v]);
-        let Some(span) = span else { continue };
+        let span_s = pair[1].0.t.secs_since(pair[0].0.t);
+        let Some(span) = joined(&pair[0], &pair[1]) else {
+            continue;
+        };
         curve.extend(
             (0..8)
                 .filter_map(|i| span.eval(span_s * f64::from(i) / 8.0))
@@ -132,7 +132,7 @@ fn path_panel(run: &Run, verdict: &Verdict, (a, b): (usize, usize)) -> Panel {
         .iter()
         .map(|(_, x)| flat(x))
         .collect();
-    let dots = verdict.path.iter().map(|k| flat(&k.x)).collect();
+    let dots = verdict.path.iter().map(|(k, _)| flat(&k.x)).collect();
     let bound_m = bound_m.unwrap_or(0.0);
     Panel {
         title: "the path, as the robot holds it".into(),

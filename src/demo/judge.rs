@@ -14,7 +14,7 @@ use telemime_robot::servo::{Mapping, RAMP_S};
 
 use super::processes::Run;
 use super::{Args, Material};
-use crate::measure::{Track, follow, rmse_m, sample_and_hold};
+use crate::measure::{Track, follow, is_edge, rmse_m, sample_and_hold};
 
 /// One way of following the hand.
 pub(super) struct Way {
@@ -39,22 +39,55 @@ pub(super) struct Verdict {
     pub(super) predicted: Way,
     pub(super) clamps: u32,
     pub(super) coasted: u32,
-    pub(super) path: Vec<DecodedKnot>,
+    /// Ticks between the first and the last recorded that the record does not hold.
+    pub(super) ticks_lost: u64,
+    pub(super) path: Vec<PathPoint>,
     /// Largest distance of the recorded path from the samples it covers, m, and how many it covers.
     pub(super) path_error_m: f64,
     pub(super) path_samples: usize,
 }
 
+/// A delay that costs less than this hides nothing worth a ratio, m.
+const LEAST_COST_M: f64 = 1e-3;
+
+/// A knot of the received path, and whether it starts afresh there.
+pub(super) type PathPoint = (DecodedKnot, bool);
+
 impl Verdict {
-    /// Share of the delay's cost that is gone; the arm's own limits are not the delay's fault.
-    pub(super) fn fraction_hidden(&self) -> f64 {
+    /// Share of the delay's cost that is gone; the arm's own limits are not the delay's fault. `None` if the delay
+    /// costs (almost) nothing.
+    pub(super) fn fraction_hidden(&self) -> Option<f64> {
         let (delayed, floor) = (self.delayed_arm.rmse_m, self.floor.rmse_m);
-        (delayed - self.predicted.rmse_m) / (delayed - floor)
+        share(delayed, self.predicted.rmse_m, floor)
     }
+
+    /// The ways whose lag is only the edge of what was searched.
+    pub(super) fn lags_at_edge(&self) -> Vec<&'static str> {
+        let ways = [
+            ("delayed", &self.delayed),
+            ("delayed_same_arm", &self.delayed_arm),
+            ("predicted", &self.predicted),
+            ("floor", &self.floor),
+        ];
+        let at_edge = ways.into_iter().filter(|(_, way)| is_edge(way.lag_s));
+        at_edge.map(|(name, _)| name).collect()
+    }
+}
+
+fn share(delayed_m: f64, predicted_m: f64, floor_m: f64) -> Option<f64> {
+    let cost_m = delayed_m - floor_m;
+    (cost_m > LEAST_COST_M).then(|| (delayed_m - predicted_m) / cost_m)
+}
+
+/// Ticks missing among those numbered so, in order.
+fn missing(ticks: &[Tick]) -> u64 {
+    let gap = |w: &[Tick]| w[1].tick.saturating_sub(w[0].tick + 1);
+    ticks.windows(2).map(gap).sum()
 }
 
 /// One tick of the robot's record.
 pub(super) struct Tick {
+    tick: u64,
     pub(super) mono_ns: i64,
     pub(super) tip_m: Vector3<f64>,
     pub(super) clamps: u32,
@@ -71,7 +104,7 @@ pub(super) fn read_ticks(path: &Path, from_ns: i64) -> anyhow::Result<Vec<Tick>>
             .position(|h| h == name)
             .with_context(|| format!("{}: no column {name}", path.display()))
     };
-    let (mono, clamps) = (column("mono_ns")?, column("clamps")?);
+    let (tick, mono, clamps) = (column("tick")?, column("mono_ns")?, column("clamps")?);
     let tip = [column("tip_x")?, column("tip_y")?, column("tip_z")?];
     let mut ticks = Vec::new();
     for row in reader.records() {
@@ -84,6 +117,7 @@ pub(super) fn read_ticks(path: &Path, from_ns: i64) -> anyhow::Result<Vec<Tick>>
                 row[tip[2]].parse()?,
             );
             ticks.push(Tick {
+                tick: row[tick].parse()?,
                 mono_ns,
                 tip_m,
                 clamps: row[clamps].parse()?,
@@ -199,6 +233,7 @@ pub(super) fn judge(args: &Args, material: &Material, run: &Run) -> anyhow::Resu
         floor: way(floor),
         predicted: way(tip),
         clamps,
+        ticks_lost: missing(&ticks),
         coasted: count_state(run, "Coasting"),
         path,
         path_error_m,
@@ -246,7 +281,7 @@ fn raw_arrivals(run: &Run, truth: &Track, zero_ns: i64) -> Vec<(f64, f64, Vector
         .collect()
 }
 
-fn received_path(run: &Run) -> Vec<DecodedKnot> {
+fn received_path(run: &Run) -> Vec<PathPoint> {
     let knots = run.robot.iter().find_map(|e| {
         if let Robot::Path { knots } = e {
             Some(knots)
@@ -254,18 +289,30 @@ fn received_path(run: &Run) -> Vec<DecodedKnot> {
             None
         }
     });
-    let decode = |(t_s, x, v): &(f64, [f64; 3], [f64; 3])| DecodedKnot {
-        t: Stamp::from_secs_f64(*t_s),
-        x: Vector3::from(*x),
-        v: Vector3::from(*v),
+    let decode = |(t_s, x, v, start): &(f64, [f64; 3], [f64; 3], bool)| {
+        let knot = DecodedKnot {
+            t: Stamp::from_secs_f64(*t_s),
+            x: Vector3::from(*x),
+            v: Vector3::from(*v),
+        };
+        (knot, *start)
     };
     knots.map_or_else(Vec::new, |knots| knots.iter().map(decode).collect())
 }
 
-/// The path's largest distance from the recording's samples between its first and last knot.
+/// The motion between two neighbouring knots; `None` across a hole.
+pub(super) fn joined(a: &PathPoint, b: &PathPoint) -> Option<HermiteSpan<3>> {
+    let ((a, _), (b, start)) = (a, b);
+    if *start {
+        return None;
+    }
+    HermiteSpan::new(b.t.secs_since(a.t), [a.x, a.v], [b.x, b.v])
+}
+
+/// The path's largest distance from the recording's samples between its first and last knot, holes left out.
 ///
 /// Knots are on the session clock, whose zero on the host's clock the operator states.
-fn path_error(path: &[DecodedKnot], truth: &Track, zero_ns: i64, run: &Run) -> (f64, usize) {
+fn path_error(path: &[PathPoint], truth: &Track, zero_ns: i64, run: &Run) -> (f64, usize) {
     let epoch_ns = run.operator.iter().find_map(|e| {
         if let Operator::Done { epoch_mono_ns, .. } = e {
             Some(*epoch_mono_ns)
@@ -280,18 +327,59 @@ fn path_error(path: &[DecodedKnot], truth: &Track, zero_ns: i64, run: &Run) -> (
     let (mut worst_m, mut covered) = (0.0_f64, 0);
     for &(t_s, x) in truth.points() {
         let session_s = t_s - offset_s;
-        let after = path.partition_point(|k| k.t.as_secs_f64() < session_s);
+        let after = path.partition_point(|(k, _)| k.t.as_secs_f64() < session_s);
         let (Some(a), Some(b)) = (
             after.checked_sub(1).and_then(|i| path.get(i)),
             path.get(after),
         ) else {
             continue;
         };
-        let span = HermiteSpan::new(b.t.secs_since(a.t), [a.x, a.v], [b.x, b.v]);
-        if let Some(jet) = span.and_then(|s| s.eval(session_s - a.t.as_secs_f64())) {
+        if let Some(jet) = joined(a, b).and_then(|s| s.eval(session_s - a.0.t.as_secs_f64())) {
             worst_m = worst_m.max((jet.x - x).norm());
             covered += 1;
         }
     }
     (worst_m, covered)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tick(tick: u64) -> Tick {
+        Tick {
+            tick,
+            mono_ns: 0,
+            tip_m: Vector3::zeros(),
+            clamps: 0,
+        }
+    }
+
+    #[test]
+    fn lost_ticks_are_counted() {
+        assert_eq!(missing(&[7, 8, 9].map(tick)), 0);
+        assert_eq!(missing(&[7, 8, 12, 13, 15].map(tick)), 4);
+        assert_eq!(missing(&[tick(3)]), 0);
+    }
+
+    #[test]
+    fn nothing_is_hidden_of_a_delay_that_costs_nothing() {
+        assert!(share(0.05, 0.02, 0.01).is_some_and(|s| (s - 0.75).abs() < 1e-12));
+        assert_eq!(share(0.0105, 0.0102, 0.01), None);
+        assert_eq!(share(0.009, 0.0102, 0.01), None);
+    }
+
+    #[test]
+    fn a_hole_is_not_bridged() {
+        let knot = |s: i64, start| {
+            let knot = DecodedKnot {
+                t: Stamp(s * 1_000_000_000),
+                x: Vector3::repeat(s as f64),
+                v: Vector3::repeat(1.0),
+            };
+            (knot, start)
+        };
+        assert!(joined(&knot(1, true), &knot(2, false)).is_some());
+        assert!(joined(&knot(1, false), &knot(2, true)).is_none());
+    }
 }

@@ -23,7 +23,8 @@ struct Result {
     rmse_delayed_same_arm_m: f64,
     rmse_floor_m: f64,
     rmse_predicted_m: f64,
-    fraction_hidden: f64,
+    fraction_hidden: Option<f64>,
+    lags_at_edge: Vec<&'static str>,
     lag_delayed_ms: f64,
     lag_delayed_same_arm_ms: f64,
     lag_floor_ms: f64,
@@ -49,6 +50,7 @@ struct Result {
     tick_mean_us: f64,
     tick_p99_us: f64,
     overruns: u32,
+    ticks_lost: u64,
 }
 
 #[derive(Debug, Clone, Copy, Serialize)]
@@ -148,6 +150,7 @@ fn gather(
         rmse_floor_m: verdict.floor.rmse_m,
         rmse_predicted_m: verdict.predicted.rmse_m,
         fraction_hidden: verdict.fraction_hidden(),
+        lags_at_edge: verdict.lags_at_edge(),
         lag_delayed_ms: verdict.delayed.lag_s * 1e3,
         lag_delayed_same_arm_ms: verdict.delayed_arm.lag_s * 1e3,
         lag_floor_ms: verdict.floor.lag_s * 1e3,
@@ -176,12 +179,17 @@ fn gather(
         tick_mean_us,
         tick_p99_us,
         overruns,
+        ticks_lost: verdict.ticks_lost,
     })
 }
 
 fn table(r: &Result) -> String {
     let mm = |m: f64| format!("{:6.1} mm", m * 1e3);
     let ms = |ms: f64| format!("{ms:5.0} ms");
+    let hidden = r.fraction_hidden.map_or_else(
+        || "the delay costs too little to tell".to_owned(),
+        |share| format!("{:.0} % of the delay's cost hidden", share * 1e2),
+    );
     let clock = r.clock_bound_ms.map_or_else(String::new, |ms| {
         format!(", session clock known to ±{ms:.0} ms")
     });
@@ -190,12 +198,12 @@ fn table(r: &Result) -> String {
          hand against tip, in hand metres      RMS error    lag\n\
          as sent, delayed, ideal tip          {}   {}\n\
          as sent, delayed, through the arm    {}   {}\n\
-         predicted                            {}   {}   {:.0} % of the delay's cost hidden\n\
+         predicted                            {}   {}   {}\n\
          floor: perfect knowledge, same arm   {}   {}\n\n\
          on the wire   {} B of motion in {} messages; raw streaming {} B; ratio {:.2}\n\
          path          {} checkpoints for {} samples; within {} of the hand ({} promised)\n\
          session       {} B up, {} B down besides (keys, model, acknowledgements, telemetry){clock}\n\
-         servo         {:.1} µs a tick, {:.1} µs p99, {} late; a limit acted on {} ticks; coasted {} times\n",
+         servo         {:.1} µs a tick, {:.1} µs p99, {} late, {} not recorded; a limit acted on {} ticks; coasted {} times\n",
         r.what,
         r.arm,
         r.scale,
@@ -209,7 +217,7 @@ fn table(r: &Result) -> String {
         ms(r.lag_delayed_same_arm_ms),
         mm(r.rmse_predicted_m),
         ms(r.lag_predicted_ms),
-        r.fraction_hidden * 1e2,
+        hidden,
         mm(r.rmse_floor_m),
         ms(r.lag_floor_ms),
         r.bytes_on_wire,
@@ -225,6 +233,7 @@ fn table(r: &Result) -> String {
         r.tick_mean_us,
         r.tick_p99_us,
         r.overruns,
+        r.ticks_lost,
         r.clamps,
         r.coasted,
     )

@@ -4,4 +4,4 @@ mod follow;
 mod track;
 
 pub use follow::{Follow, follow};
-pub use track::{Track, TrackError, rmse_m, sample_and_hold};
+pub use track::{Track, TrackError, is_edge, rmse_m, sample_and_hold};

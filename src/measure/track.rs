@@ -79,6 +79,12 @@ impl Track {
     }
 }
 
+/// Whether a lag lies at the end of what [`Track::lag_behind`] searches: the true one may be beyond.
+pub fn is_edge(lag_s: f64) -> bool {
+    let ms = (lag_s * 1e3).round() as i32;
+    ms == *LAG_RANGE_MS.start() || ms == *LAG_RANGE_MS.end()
+}
+
 /// Root mean square distance of two tracks over the times `grid_s`, m.
 pub fn rmse_m(a: &Track, b: &Track, grid_s: &[f64]) -> f64 {
     let sum: f64 = grid_s
@@ -126,6 +132,16 @@ mod tests {
             (lag_s - 0.123).abs() < 1e-9 && rest_m < 1e-3,
             "{lag_s} {rest_m}"
         );
+        assert!(!is_edge(lag_s));
+        // A ramp a second late: no shift that is searched is enough.
+        let ramp = |shift_s: f64| {
+            let point = |i: i32| {
+                let t = f64::from(i) * 0.01;
+                (t, Vector3::new(t - shift_s, 0.0, 0.0))
+            };
+            Track::new((0..=500).map(point).collect()).unwrap()
+        };
+        assert!(is_edge(ramp(1.0).lag_behind(&ramp(0.0), &grid).0));
     }
 
     #[test]

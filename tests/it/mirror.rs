@@ -41,7 +41,7 @@ fn run(rig: &Rig, seed: u64) -> Run {
             RobotNotice::Path(path) => Some(path.clone()),
             _ => None,
         });
-        let from_zero = |(t_s, x, v): (f64, [f64; 3], [f64; 3])| {
+        let from_zero = |(t_s, x, v, _): (f64, [f64; 3], [f64; 3], bool)| {
             (t_s - session_zero.as_secs_f64(), x.into(), v.into())
         };
         Run {

@@ -75,6 +75,11 @@ impl PathDecoder {
         self.knots.iter().map(|(k, _)| k)
     }
 
+    /// As [`PathDecoder::knots`], with whether the path starts afresh there.
+    pub fn marked(&self) -> impl ExactSizeIterator<Item = (&DecodedKnot, bool)> {
+        self.knots.iter().map(|(k, start)| (k, *start))
+    }
+
     fn end_of_piece(&self, index: usize) -> Option<Jet<3>> {
         let (b, start) = self.knots.get(index)?;
         let before = index.checked_sub(1).and_then(|i| self.knots.get(i));
