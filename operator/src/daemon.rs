@@ -6,9 +6,9 @@ use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use quinn::{Connection, Endpoint, SendStream, VarInt};
+use quinn::{Connection, Endpoint, VarInt};
 use telemime_endpoint::cli::{Word, told};
-use telemime_endpoint::control::{Control, ControlError, write_frame};
+use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::meter::Counts;
 use telemime_endpoint::{HostClock, Meter, Mono, quic};
 use telemime_protocol::skill::Skill;
@@ -126,7 +126,7 @@ pub enum Notice {
 
 struct Link {
     connection: Connection,
-    send: SendStream,
+    writer: Writer,
     frames: mpsc::Receiver<Result<Frame, ControlError>>,
     epoch: u32,
 }
@@ -317,10 +317,10 @@ impl Daemon {
                 epoch,
                 ..
             } => {
-                let (send, frames) = control.into_frames();
+                let (writer, frames) = control.into_frames();
                 Ok(Link {
                     connection,
-                    send,
+                    writer,
                     frames,
                     epoch,
                 })
@@ -343,7 +343,7 @@ impl Daemon {
     ) -> End {
         let notices = console.notices;
         loop {
-            if let Err(e) = self.flush(session, &mut link, marks).await {
+            if let Err(e) = self.flush(session, &link, marks) {
                 return End::Lost(e.to_string());
             }
             let now = self.now();
@@ -375,7 +375,7 @@ impl Daemon {
                 marks.progress = task.progress();
                 let _ = notices.send(Notice::Progress(marks.progress));
             }
-            if let Err(e) = self.flush(session, &mut link, marks).await {
+            if let Err(e) = self.flush(session, &link, marks) {
                 return End::Lost(e.to_string());
             }
             let due = [
@@ -415,16 +415,16 @@ impl Daemon {
         }
     }
 
-    async fn flush(
+    fn flush(
         &self,
         session: &mut Session,
-        link: &mut Link,
+        link: &Link,
         marks: &mut Marks,
     ) -> Result<(), ControlError> {
         marks.on_request(session.requests(), self.meter.counts());
         while let Some(output) = session.poll_output() {
             match output {
-                Output::Control(payload) => write_frame(&mut link.send, &payload).await?,
+                Output::Control(payload) => link.writer.message(&payload)?,
                 Output::Datagram { bytes, motion } => {
                     if motion {
                         self.meter.mark_motion(bytes.len());
@@ -438,15 +438,18 @@ impl Daemon {
     }
 
     /// Releases, says goodbye, and waits until the robot has read it.
-    async fn leave(&self, session: &mut Session, mut link: Link, marks: &mut Marks) -> End {
+    async fn leave(&self, session: &mut Session, link: Link, marks: &mut Marks) -> End {
         session.goodbye();
-        if self.flush(session, &mut link, marks).await.is_ok() {
-            let _ = link.send.finish();
-            let _ = timeout(Duration::from_secs(1), link.send.stopped()).await;
+        let said = self.flush(session, &link, marks);
+        let Link {
+            connection, writer, ..
+        } = link;
+        if said.is_ok() {
+            writer.finish(Duration::from_secs(1)).await;
         }
         // Only now has QUIC sent what it was given; after the release that is no motion any more.
         marks.released = Some(self.meter.counts());
-        link.connection.close(VarInt::from_u32(0), b"goodbye");
+        connection.close(VarInt::from_u32(0), b"goodbye");
         End::Finished
     }
 }

@@ -2,24 +2,23 @@
 
 mod error;
 
-/// Whether `name` matches `pattern`, in which `*` stands for any text.
+/// Whether `name` matches `pattern`, in which `*` stands for any text. Each piece between stars is taken where
+/// it first occurs, which never rules a later one out.
 fn matches(pattern: &str, name: &str) -> bool {
     let Some((head, rest)) = pattern.split_once('*') else {
         return pattern == name;
     };
-    let Some(mut tail) = name.strip_prefix(head) else {
+    let Some(mut name) = name.strip_prefix(head) else {
         return false;
     };
-    loop {
-        if matches(rest, tail) {
-            return true;
-        }
-        let mut chars = tail.chars();
-        if chars.next().is_none() {
+    let (middle, tail) = rest.rsplit_once('*').unwrap_or(("", rest));
+    for piece in middle.split('*') {
+        let Some(at) = name.find(piece) else {
             return false;
-        }
-        tail = chars.as_str();
+        };
+        name = &name[at + piece.len()..];
     }
+    name.ends_with(tail)
 }
 
 #[cfg(test)]
@@ -42,7 +41,7 @@ const LARGEST: f64 = 1e6;
 /// The hand at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sample {
-    /// Time, s.
+    /// Time since the first sample, s.
     pub t_s: f64,
     /// Position, m.
     pub position: Vector3<f64>,
@@ -95,6 +94,8 @@ impl Demonstration {
         let wanted = [index("t")?, index("x")?, index("y")?, index("z")?];
 
         let mut samples: Vec<Sample> = Vec::new();
+        // Recordings stamped since 1970 are as good as any: only differences mean something.
+        let mut zero_s = None;
         let mut record = csv::StringRecord::new();
         while reader
             .read_record(&mut record)
@@ -110,6 +111,9 @@ impl Demonstration {
                     column,
                     text: text.to_owned(),
                 })?;
+                if column == "t" && value.is_finite() {
+                    *value -= *zero_s.get_or_insert(*value);
+                }
                 if !usable(*value) {
                     return Err(DemonstrationError::NotFinite {
                         path,

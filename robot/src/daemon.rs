@@ -3,16 +3,15 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use quinn::{Connection, Endpoint, Incoming, SendStream, VarInt};
+use quinn::{Connection, Endpoint, Incoming, VarInt};
 use telemime_endpoint::cli::{Word, told};
-use telemime_endpoint::control::{Control, ControlError};
+use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::{HostClock, quic};
 use telemime_protocol::skill::Skill;
-use telemime_protocol::wire::frame::{self, Frame};
+use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode, negotiate};
 use telemime_protocol::wire::v1::{self, Cause, Info, RobotState};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
-use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval, sleep_until};
 
 use crate::servo::thread::Timing;
@@ -31,9 +30,6 @@ const FAULT: u32 = 4;
 
 /// What is still to be said when a session ends gets this long.
 const LAST_WORDS: Duration = Duration::from_millis(500);
-
-/// Control messages an operator may leave unread.
-const MAX_UNREAD: usize = 256;
 
 /// Drains (0.5 s) without a word from the servo.
 const MAX_SILENT_DRAINS: u32 = 125;
@@ -102,9 +98,7 @@ struct Greeted {
 struct Active {
     session: Session,
     connection: Connection,
-    /// Towards the operator, written by a task of its own: who does not read holds up nobody.
-    writer: mpsc::Sender<Vec<u8>>,
-    written: JoinHandle<()>,
+    writer: Writer,
     frames: mpsc::Receiver<Result<Frame, ControlError>>,
 }
 
@@ -264,10 +258,9 @@ impl Daemon {
             features: 0,
             epoch: *epoch,
         };
-        let (send, frames) = control.into_frames();
-        let (writer, queue) = mpsc::channel(MAX_UNREAD);
-        let _ = writer.try_send(ack.encode());
-        let written = tokio::spawn(write(send, queue));
+        let (writer, frames) = control.into_frames();
+        // The first of an empty queue.
+        let _ = writer.raw(ack.encode());
         let session = Session::new(
             self.config,
             self.info.clone(),
@@ -279,7 +272,6 @@ impl Daemon {
             session,
             connection,
             writer,
-            written,
             frames,
         });
         let _ = notices.send(Notice::Connected {
@@ -334,15 +326,8 @@ impl Daemon {
         while let Some(output) = active.session.poll_output() {
             match output {
                 Output::Control(payload) => {
-                    if active
-                        .writer
-                        .try_send(frame::encode(&payload, false))
-                        .is_err()
-                    {
-                        return Some((
-                            CLOSED,
-                            "the operator does not read what the robot says".into(),
-                        ));
+                    if let Err(e) = active.writer.message(&payload) {
+                        return Some((CLOSED, e.to_string()));
                     }
                 }
                 Output::Brake(cause) => self.servo.brake.pull(cause),
@@ -372,16 +357,12 @@ impl Daemon {
             }
         }
         let Active {
-            connection,
-            writer,
-            written,
-            ..
+            connection, writer, ..
         } = ended;
         let ended = ended.session;
-        drop(writer);
         let reason = why.as_bytes().to_vec();
         tokio::spawn(async move {
-            let _ = tokio::time::timeout(LAST_WORDS, written).await;
+            writer.finish(LAST_WORDS).await;
             connection.close(VarInt::from_u32(code), &reason);
         });
         if let Some(held) = ended.skill() {
@@ -429,17 +410,6 @@ async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<(u32,
             Err(e) => Some((CLOSED, quic::explain(&e))),
         },
     }
-}
-
-/// Writes the control stream until the session drops it or the operator is gone.
-async fn write(mut send: SendStream, mut queue: mpsc::Receiver<Vec<u8>>) {
-    while let Some(bytes) = queue.recv().await {
-        if send.write_all(&bytes).await.is_err() {
-            return;
-        }
-    }
-    let _ = send.finish();
-    let _ = send.stopped().await;
 }
 
 /// Handshake and greeting, beside the running session.

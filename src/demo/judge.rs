@@ -105,12 +105,14 @@ pub(super) fn read_ticks(path: &Path, from_ns: i64) -> anyhow::Result<Vec<Tick>>
             .with_context(|| format!("{}: no column {name}", path.display()))
     };
     let (tick, mono, clamps) = (column("tick")?, column("mono_ns")?, column("clamps")?);
+    let engagement = column("engagement")?;
     let tip = [column("tip_x")?, column("tip_y")?, column("tip_z")?];
-    let mut ticks = Vec::new();
+    let (mut ticks, mut first) = (Vec::new(), None);
     for row in reader.records() {
         let row = row?;
         let mono_ns: i64 = row[mono].parse()?;
-        if mono_ns >= from_ns {
+        let number: u32 = row[engagement].parse()?;
+        if mono_ns >= from_ns && *first.get_or_insert(number) == number {
             let tip_m = Vector3::new(
                 row[tip[0]].parse()?,
                 row[tip[1]].parse()?,
@@ -265,19 +267,20 @@ fn raw_arrivals(run: &Run, truth: &Track, zero_ns: i64) -> Vec<(f64, f64, Vector
         })
         .collect();
     up.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let nearest = |t_s: f64| {
+    // Our packets are fewer than raw samples would be: a packet lost once loses one sample, not all near it.
+    let mut spent = vec![false; up.len()];
+    let mut fate = |t_s: f64| {
         let after = up.partition_point(|p| p.0 < t_s);
-        let candidates = [after.checked_sub(1).and_then(|i| up.get(i)), up.get(after)];
-        candidates
-            .into_iter()
-            .flatten()
-            .min_by(|a, b| (a.0 - t_s).abs().total_cmp(&(b.0 - t_s).abs()))
-            .and_then(|p| p.1)
+        let mut near: Vec<usize> = (after.saturating_sub(8)..(after + 8).min(up.len())).collect();
+        near.sort_by(|&a, &b| (up[a].0 - t_s).abs().total_cmp(&(up[b].0 - t_s).abs()));
+        let first = near.into_iter().find(|&i| up[i].1.is_some() || !spent[i])?;
+        spent[first] |= up[first].1.is_none();
+        up[first].1
     };
     truth
         .points()
         .iter()
-        .filter_map(|&(t_s, x)| nearest(t_s).map(|delay_s| (t_s + delay_s, t_s, x)))
+        .filter_map(|&(t_s, x)| fate(t_s).map(|delay_s| (t_s + delay_s, t_s, x)))
         .collect()
 }
 

@@ -103,6 +103,8 @@ fn material(args: &Args, scratch: &Path) -> anyhow::Result<Material> {
         Some(path) => (path.clone(), Demonstration::read_csv(path)?),
         None => match found.demonstrations.as_slice() {
             [_, .., last] => (last.path().to_owned(), last.clone()),
+            // Playing learns from all there is and drives none.
+            [only] if args.play => (only.path().to_owned(), only.clone()),
             _ => bail!(
                 "{}: one recording to learn from and another to drive are needed",
                 demos.display()

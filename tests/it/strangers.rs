@@ -5,7 +5,7 @@ use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use telemime::ground::{Pair, run_virtual};
 use telemime_endpoint::Identity;
-use telemime_endpoint::control::{Control, write_frame};
+use telemime_endpoint::control::Control;
 use telemime_operator::daemon::DaemonError;
 use telemime_operator::task::Outcome;
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
@@ -180,10 +180,10 @@ fn garbage_from_a_paired_peer_is_counted_and_does_no_harm() {
             pair.run_for(2e-3).await;
         }
         // The session is as good as before: it stores a model.
-        let (mut send, mut frames) = control.into_frames();
+        let (writer, mut frames) = control.into_frames();
         let (id, bytes) = (skill().id().0, skill().to_bytes().to_vec());
         let model = OperatorControl::Model { id, bytes }.encode();
-        write_frame(&mut send, &model).await.unwrap();
+        writer.message(&model).unwrap();
         loop {
             let frame = frames.recv().await.unwrap().unwrap();
             match RobotControl::decode(&frame.payload).unwrap() {
@@ -192,9 +192,7 @@ fn garbage_from_a_paired_peer_is_counted_and_does_no_harm() {
                 other => panic!("{other:?}"),
             }
         }
-        write_frame(&mut send, &OperatorControl::Goodbye.encode())
-            .await
-            .unwrap();
+        writer.message(&OperatorControl::Goodbye.encode()).unwrap();
         pair.run_for(0.1).await;
         let dropped = pair.robot.notices().iter().find_map(|n| match n {
             RobotNotice::Disconnected { counters, .. } => Some(counters.dropped),
@@ -214,8 +212,8 @@ fn a_malformed_control_message_ends_the_session_and_only_that() {
         let mut pair = Pair::start(&rig()).unwrap();
         let endpoint = pair.stranger(&delayed(0.02), 37).unwrap();
         let (connection, control, _) = greet(&endpoint, &pair, &hello(VERSION, VERSION)).await;
-        let (mut send, _frames) = control.into_frames();
-        write_frame(&mut send, &[200, 1, 2]).await.unwrap();
+        let (writer, _frames) = control.into_frames();
+        writer.message(&[200, 1, 2]).unwrap();
         let closed = connection.closed().await.to_string();
         assert!(closed.contains("control message"), "{closed}");
 
@@ -236,7 +234,7 @@ fn a_new_session_is_told_at_once_that_the_arm_holds() {
         pair.run_for(2.5).await;
         let endpoint = pair.stranger(&delayed(0.02), 40).unwrap();
         let (_connection, control, _) = greet(&endpoint, &pair, &hello(VERSION, VERSION)).await;
-        let (_send, mut frames) = control.into_frames();
+        let (_writer, mut frames) = control.into_frames();
         let first = frames.recv().await.unwrap().unwrap();
         let first = RobotControl::decode(&first.payload).unwrap();
         let RobotControl::Info(Info { state, model, .. }) = first else {

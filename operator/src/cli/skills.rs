@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::{Context, bail};
 use nalgebra::{SVector, Vector3};
 use telemime_protocol::checkpoint::{Plan, select};
-use telemime_protocol::skill::{Gmr, MAX_NAME_BYTES, Skill};
+use telemime_protocol::skill::{Gmr, MAX_COMPONENTS, MAX_NAME_BYTES, Skill};
 use telemime_protocol::wire::codec;
 
 use super::Args;
@@ -71,7 +71,8 @@ impl Skills {
         skills.mirror = skills.all.first().cloned();
         if args.learn.len() > 1 && args.play.is_none() {
             let mut shared = options;
-            shared.predictor.components = SHARED_COMPONENTS * args.learn.len();
+            shared.predictor.components =
+                (SHARED_COMPONENTS * args.learn.len()).min(MAX_COMPONENTS);
             // Only its predictor is used: one time axis for different motions means nothing.
             shared.motion_components = 1..=1;
             let name: Vec<_> = skills

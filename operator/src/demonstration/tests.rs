@@ -159,3 +159,12 @@ fn a_pattern_picks_files_by_name() {
     assert!(matching("*", "") && matching("*t1", "a3_s2_t1") && matching("a*s2*", "a3_s2_t1"));
     assert!(!matching("a", "ab") && !matching("*x*", "abc"));
 }
+
+#[test]
+fn times_count_from_the_first_sample_whatever_the_clock() {
+    let rows: String = (0..10)
+        .map(|i| format!("{}.5,0.{i},0,1\n", 1_700_000_000 + i))
+        .collect();
+    let read = Demonstration::parse("unix.csv", format!("t,x,y,z\n{rows}").as_bytes()).unwrap();
+    assert_eq!((read.samples()[0].t_s, read.last().t_s), (0.0, 9.0));
+}

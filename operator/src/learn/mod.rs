@@ -12,7 +12,9 @@ mod tests;
 mod trial;
 
 use telemime_protocol::predict::ModelError;
-use telemime_protocol::skill::{Gmm, MAX_COMPONENTS, Provenance, Skill, SkillError, Source};
+use telemime_protocol::skill::{
+    Gmm, MAX_COMPONENTS, MAX_NAME_BYTES, MAX_SOURCES, Provenance, Skill, SkillError, Source,
+};
 
 use crate::demonstration::Demonstration;
 
@@ -25,6 +27,16 @@ pub enum LearnError {
     /// No demonstration was given.
     #[error("no demonstrations: at least one is needed, three or more are better")]
     NoDemonstrations,
+    /// More demonstrations than a skill can name as its origin.
+    #[error(
+        "{found} demonstrations, at most {limit} make one skill: learn from some of them, with --match"
+    )]
+    TooMany {
+        /// How many.
+        found: usize,
+        /// How many are possible.
+        limit: usize,
+    },
     /// K is zero or beyond what a mixture may have.
     #[error("{asked} mixture components asked for, 1 to 64 are possible")]
     Components {
@@ -126,6 +138,12 @@ pub fn learn_skill(
     options: &LearnOptions,
     mut progress: impl FnMut(Progress),
 ) -> Result<Skill, LearnError> {
+    if demonstrations.len() > MAX_SOURCES {
+        return Err(LearnError::TooMany {
+            found: demonstrations.len(),
+            limit: MAX_SOURCES,
+        });
+    }
     let aligned = align::align(demonstrations)?;
     progress(Progress::Aligned {
         medoid: demonstrations[aligned.medoid].name().to_owned(),
@@ -148,6 +166,15 @@ pub fn learn_skill(
     )
 }
 
+/// A recording's name, as much of it as a skill holds.
+fn short(name: &str) -> String {
+    let mut name = name.to_owned();
+    while name.len() > 2 * MAX_NAME_BYTES {
+        name.pop();
+    }
+    name
+}
+
 fn assemble(
     name: &str,
     demonstrations: &[Demonstration],
@@ -159,7 +186,7 @@ fn assemble(
     let sources = demonstrations
         .iter()
         .map(|d| Source {
-            name: d.name().to_owned(),
+            name: short(d.name()),
             sha256: *d.sha256(),
         })
         .collect();

@@ -17,6 +17,9 @@ const PRIOR: f64 = 10.0;
 /// Bounds of the mixture's trust before anything was seen: whatever was calibrated can still be outvoted.
 const PRIOR_TRUST: std::ops::RangeInclusive<f64> = 0.05..=0.98;
 
+/// Without a mixture an error of this size is one, m: what a depth sensor is good for.
+const SENSOR_M: f64 = 0.01;
+
 /// A hand that has moved less than this share of the skill's reach lately is at rest.
 const REST: f64 = 0.02;
 
@@ -134,7 +137,8 @@ impl Adaptation {
             .at(horizon_s)
             .position;
         if self.prior.is_none() {
-            self.prior = mixture.map(|p| PRIOR * (3.0 * p.sigma_m * p.sigma_m).max(1e-8));
+            let sigma_m = mixture.map_or(SENSOR_M, |p| p.sigma_m);
+            self.prior = Some(PRIOR * (3.0 * sigma_m * sigma_m).max(1e-8));
         }
         self.pending.push_back(Pending {
             due: newest.t.offset_by_secs(horizon_s),

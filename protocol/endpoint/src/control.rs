@@ -7,6 +7,7 @@ use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::frame::{self, Deframer, Frame};
 use telemime_protocol::wire::hello::{self, Answer, Hello, HelloError};
 use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
 /// A peer that connects but does not greet within this time is let go.
@@ -30,6 +31,9 @@ pub enum ControlError {
     /// The greeting was none.
     #[error("greeting: {0}")]
     Hello(#[from] HelloError),
+    /// The peer leaves what we say unread, or is gone.
+    #[error("the peer does not read what is sent")]
+    Unread,
     /// A frame was malformed.
     #[error("control message: {0}")]
     Frame(#[from] DecodeError),
@@ -101,10 +105,10 @@ impl Control {
     }
 
     /// Greetings are over: frames arrive on the receiver, after whose last item the stream has ended.
-    pub fn into_frames(self) -> (SendStream, mpsc::Receiver<Result<Frame, ControlError>>) {
+    pub fn into_frames(self) -> (Writer, mpsc::Receiver<Result<Frame, ControlError>>) {
         let (tx, rx) = mpsc::channel(READ_AHEAD);
         tokio::spawn(read_frames(self.recv, self.read, tx));
-        (self.send, rx)
+        (Writer::start(self.send), rx)
     }
 
     async fn greeting<T>(
@@ -134,14 +138,56 @@ impl Control {
     }
 }
 
-/// Writes one message as a frame.
-///
-/// # Errors
-/// [`ControlError::Stream`] if the stream has ended.
-pub async fn write_frame(send: &mut SendStream, payload: &[u8]) -> Result<(), ControlError> {
-    send.write_all(&frame::encode(payload, false))
-        .await
-        .map_err(|e| ControlError::Stream(e.to_string()))
+/// Messages a peer may leave unread before the session is given up.
+const MAX_UNREAD: usize = 256;
+
+/// The sending half, written by a task of its own: a peer that does not read, or a model that takes its
+/// time on a thin link, holds up nobody.
+#[derive(Debug)]
+pub struct Writer {
+    queue: mpsc::Sender<Vec<u8>>,
+    written: JoinHandle<()>,
+}
+
+impl Writer {
+    /// Starts writing to `send`.
+    pub fn start(send: SendStream) -> Self {
+        let (queue, due) = mpsc::channel(MAX_UNREAD);
+        let written = tokio::spawn(write(send, due));
+        Self { queue, written }
+    }
+
+    /// Queues raw bytes: a greeting.
+    ///
+    /// # Errors
+    /// [`ControlError::Unread`] if the peer has left too much unread, or is gone.
+    pub fn raw(&self, bytes: Vec<u8>) -> Result<(), ControlError> {
+        self.queue.try_send(bytes).map_err(|_| ControlError::Unread)
+    }
+
+    /// Queues a message as a frame.
+    ///
+    /// # Errors
+    /// As [`Writer::raw`].
+    pub fn message(&self, payload: &[u8]) -> Result<(), ControlError> {
+        self.raw(frame::encode(payload, false))
+    }
+
+    /// Writes what is queued, ends the stream and waits for the peer to have it, but no longer than `within`.
+    pub async fn finish(self, within: Duration) {
+        drop(self.queue);
+        let _ = timeout(within, self.written).await;
+    }
+}
+
+async fn write(mut send: SendStream, mut due: mpsc::Receiver<Vec<u8>>) {
+    while let Some(bytes) = due.recv().await {
+        if send.write_all(&bytes).await.is_err() {
+            return;
+        }
+    }
+    let _ = send.finish();
+    let _ = send.stopped().await;
 }
 
 async fn read_frames(

@@ -4,8 +4,8 @@ use nalgebra::{SMatrix, SVector};
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Gmm, MAX_NAME_BYTES, MAX_SKILL_BYTES, MAX_SOURCES, Provenance, Skill, SkillError, SkillId,
-    Stats, sha256,
+    Gmm, MAX_DURATION_S, MAX_NAME_BYTES, MAX_SKILL_BYTES, MAX_SOURCES, Provenance, Skill,
+    SkillError, SkillId, Stats, sha256,
 };
 use crate::predict::{
     BLOCK, Calibration, FEATURES, MAX_KNOTS, Model, ModelError, Params, Regression,
@@ -100,7 +100,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Skill, SkillError> {
             bytes: raw.name.len(),
         });
     }
-    if !(raw.duration_s.is_finite() && raw.duration_s > 0.0) {
+    if !(raw.duration_s > 0.0 && raw.duration_s <= MAX_DURATION_S) {
         return Err(SkillError::Duration {
             seconds: raw.duration_s,
         });

@@ -28,6 +28,9 @@ pub const MAX_SKILL_BYTES: usize = 512 * 1024;
 /// The most bytes a skill's name may have.
 pub const MAX_NAME_BYTES: usize = 64;
 
+/// The longest motion a skill may have, s.
+pub const MAX_DURATION_S: f64 = 3600.0;
+
 /// The most demonstrations a skill may name as its origin.
 pub const MAX_SOURCES: usize = 256;
 
@@ -100,8 +103,8 @@ pub enum SkillError {
         /// Its length.
         bytes: usize,
     },
-    /// The duration is not a positive number.
-    #[error("a duration of {seconds} s")]
+    /// The duration is not a positive number, or longer than [`MAX_DURATION_S`].
+    #[error("a duration of {seconds} s: more than 0 s and at most an hour are possible")]
     Duration {
         /// The duration, s.
         seconds: f64,
