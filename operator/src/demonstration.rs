@@ -102,7 +102,7 @@ impl Demonstration {
             .map_err(|e| csv_error(&path, &e))?
         {
             let line = record.position().map_or(0, csv::Position::line);
-            let mut values = [0.0; 4];
+            let mut values = [0.0_f64; 4];
             for ((value, &at), column) in values.iter_mut().zip(&wanted).zip(["t", "x", "y", "z"]) {
                 let text = record.get(at).unwrap_or_default();
                 *value = text.parse().map_err(|_| DemonstrationError::NotANumber {
