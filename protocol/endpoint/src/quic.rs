@@ -28,9 +28,10 @@ pub const KEEP_ALIVE: Duration = Duration::from_millis(250);
 /// Congestion window floor, bytes: 100 messages a second of about 95 B through a 25 s outage.
 const WINDOW_FLOOR: u64 = 256 * 1024;
 
-/// Stream bytes under way at once: a model on a thin link must not fill the queue in front of everything that
-/// has to be fresh. 16 KiB are 2 s at 64 kbit/s; a model of 85 kB takes five round trips.
-const SEND_WINDOW: u64 = 16 * 1024;
+/// Stream bytes under way at once: a model on a thin link must not fill the queue in front of stops and
+/// pongs for as long as it is (100 kB, 13 s at 64 kbit/s; so it is 4 s), and on a usual one must not take long
+/// either (three round trips and their delayed acknowledgements).
+const SEND_WINDOW: u64 = 32 * 1024;
 
 /// Datagrams QUIC may hold back: two of ours, each with quinn's 32 B of bookkeeping. The newest wins.
 const DATAGRAM_SEND_BUFFER: usize = 2 * (v1::MAX_DATAGRAM_LEN + 32);

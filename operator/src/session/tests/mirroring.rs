@@ -272,7 +272,7 @@ fn the_robot_ends_with_the_whole_path_whatever_is_lost() {
             let error_m = (path.eval(tick).expect("no hole").x - x).norm();
             assert!(error_m <= 0.005, "{name}: {error_m} m off");
         }
-        assert!(covered > 280, "{name}: {covered} of 300 samples");
+        assert!(covered > 265, "{name}: {covered} of 300 samples");
         if name == "nothing" {
             assert!(
                 carried <= 2 * made as usize,
