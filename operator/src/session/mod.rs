@@ -4,24 +4,27 @@
 //! both are empty, then [`Session::poll_timeout`] for when to call [`Session::handle_timeout`].
 
 mod adapt;
+mod config;
+mod hear;
 mod mirror;
+mod said;
 #[cfg(test)]
 mod tests;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use nalgebra::{UnitQuaternion, Vector3};
 use telemime_protocol::checkpoint::Plan;
 use telemime_protocol::predict::HandState;
-use telemime_protocol::skill::{Skill, Stats};
+use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
-use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::codec;
 use telemime_protocol::wire::v1::{
-    Cause, Drive, Engage, Info, Message, OperatorControl, OperatorDatagram, PathTail, Refusal,
-    RobotControl, RobotDatagram, RobotState, Telemetry,
+    Drive, Engage, Info, Message, OperatorControl, OperatorDatagram, PathTail, Refusal, RobotState,
 };
-use telemime_protocol::wire::{DecodeError, codec};
+
+pub use config::{FutureBound, HandSample, SessionConfig, default_scale};
+pub use said::{Counters, Event, Output};
 
 use mirror::Mirror;
 
@@ -30,126 +33,6 @@ const STOP_REPEAT_S: f64 = 0.01;
 
 /// In play the operator speaks at least this often, s: a lost go must not make the arm coast, and it costs little.
 pub const GO_S: f64 = 0.1;
-
-/// How far the robot's prediction may be off before the operator speaks.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum FutureBound {
-    /// A distance, m.
-    Absolute(f64),
-    /// A multiple of the predicted standard deviation.
-    Relative(f64),
-}
-
-/// What a session is set to.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SessionConfig {
-    /// The operator speaks at least this often, s.
-    pub max_silence_s: f64,
-    /// Two motions are at least this far apart, s, however fast the samples come.
-    pub min_interval_s: f64,
-    /// For how long each message authorises motion, s.
-    pub lease_s: f64,
-    /// ε_future.
-    pub future_bound: FutureBound,
-    /// ε_path, m; `None` is 2 % of the skill's reach.
-    pub path_bound_m: Option<f64>,
-    /// Prediction gain κ in [0, 1].
-    pub gain: f64,
-    /// Tip metres per hand metre; `None` derives it from the demonstrations and the arm's limits.
-    pub scale: Option<f64>,
-    /// Hand axes to the robot's base axes.
-    pub rotation: UnitQuaternion<f64>,
-}
-
-impl Default for SessionConfig {
-    fn default() -> Self {
-        Self {
-            max_silence_s: 0.2,
-            min_interval_s: 0.01,
-            lease_s: 0.65,
-            future_bound: FutureBound::Relative(0.6),
-            path_bound_m: None,
-            gain: 1.0,
-            scale: None,
-            rotation: UnitQuaternion::identity(),
-        }
-    }
-}
-
-/// The hand at one moment.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct HandSample {
-    /// When it is valid.
-    pub t: Stamp,
-    /// Position, m.
-    pub x: Vector3<f64>,
-    /// Made up, so that a recording begins at rest: followed like any other, and counted apart.
-    pub resting: bool,
-}
-
-/// What a session wants sent.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Output {
-    /// A message for the control stream, not yet framed.
-    Control(Vec<u8>),
-    /// A datagram.
-    Datagram {
-        /// Its bytes.
-        bytes: Vec<u8>,
-        /// Whether it carries motion (the others keep time).
-        motion: bool,
-    },
-}
-
-/// What has happened.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Event {
-    /// The robot has introduced itself, and holds the model.
-    Ready,
-    /// The arm follows.
-    Engaged {
-        /// Which engagement.
-        engagement: u32,
-        /// When, µs on the session clock as the robot estimates it.
-        t_us: i64,
-        /// The hand position that corresponds to `tip_m`, m.
-        hand_m: [f32; 3],
-        /// The tip at that instant, m.
-        tip_m: [f32; 3],
-    },
-    /// A request was declined.
-    Refused(Refusal),
-    /// The robot's state changed.
-    State(RobotState, Cause),
-    /// News of the robot.
-    Telemetry(Box<Telemetry>),
-}
-
-/// What the session counts.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Counters {
-    /// Samples taken from the request that was granted to the release, those made up at rest left out.
-    pub samples: u32,
-    /// Those at rest.
-    pub rest_samples: u32,
-    /// Motions and goes sent, from that request on.
-    pub messages: u32,
-    /// Path knots made.
-    pub knots: u32,
-    /// Datagrams dropped.
-    pub dropped: u32,
-}
-
-impl Counters {
-    /// Adds another session's counts.
-    pub fn add(&mut self, other: Self) {
-        self.samples += other.samples;
-        self.rest_samples += other.rest_samples;
-        self.messages += other.messages;
-        self.knots += other.knots;
-        self.dropped += other.dropped;
-    }
-}
 
 enum Activity {
     Nothing,
@@ -185,16 +68,6 @@ pub struct Session {
     before: Option<Counters>,
     outputs: VecDeque<Output>,
     events: VecDeque<Event>,
-}
-
-/// The largest scale at which the demonstrated motion stays within 0.8 of the arm's speed and
-/// acceleration, and within its reach; never above 1 (driving.md §2).
-pub fn default_scale(stats: &Stats, info: &Info) -> f64 {
-    let within = |limit: f32, demonstrated: f64| f64::from(limit) / demonstrated.max(1e-6);
-    let speed = 0.8 * within(info.speed_m_s, stats.speed95_m_s);
-    let acceleration = 0.8 * within(info.accel_m_s2, stats.acceleration95_m_s2);
-    let reach = within(info.radius_m, stats.reach_m);
-    speed.min(acceleration).min(reach).clamp(1e-3, 1.0)
 }
 
 impl Session {
@@ -266,109 +139,6 @@ impl Session {
             .as_ref()
             .map_or(0.02, |skill| 0.02 * skill.stats().reach_m);
         self.config.path_bound_m.unwrap_or(derived).max(1e-4)
-    }
-
-    /// A frame from the control stream.
-    ///
-    /// # Errors
-    /// [`DecodeError`] for a frame that may not be ignored; the session is then over.
-    pub fn handle_control(&mut self, now: Stamp, frame: &Frame) -> Result<(), DecodeError> {
-        let message = match RobotControl::decode(&frame.payload) {
-            Ok(message) => message,
-            Err(_) if frame.ignorable => return Ok(()),
-            Err(e) => return Err(e),
-        };
-        match message {
-            RobotControl::Info(info) => self.on_info(info),
-            RobotControl::ModelStored { id } => {
-                if self.skill.as_ref().is_some_and(|skill| skill.id().0 == id) && !self.model_stored
-                {
-                    self.model_stored = true;
-                    self.events.push_back(Event::Ready);
-                }
-            }
-            RobotControl::PlanStored { id } => {
-                if let Activity::Play {
-                    plan,
-                    engaged: engaged @ false,
-                } = &mut self.activity
-                    && *plan == id
-                {
-                    *engaged = true;
-                    self.request(now, Drive::Play { plan: id });
-                    self.last_sent = now;
-                }
-            }
-            RobotControl::Engaged {
-                engagement,
-                t_us,
-                hand_m,
-                tip_m,
-            } => {
-                self.before = None;
-                self.events.push_back(Event::Engaged {
-                    engagement,
-                    t_us,
-                    hand_m,
-                    tip_m,
-                });
-            }
-            RobotControl::Refused { reason } => {
-                if let (Refusal::Diverged, Activity::Mirror(mirror)) = (reason, &mut self.activity)
-                {
-                    mirror.go_without_model();
-                } else {
-                    self.activity = Activity::Nothing;
-                    // What was sent for nothing is not what following took.
-                    if let Some(before) = self.before.take() {
-                        let dropped = self.counters.dropped;
-                        self.counters = Counters { dropped, ..before };
-                    }
-                }
-                self.events.push_back(Event::Refused(reason));
-            }
-            RobotControl::State {
-                state,
-                cause,
-                changes,
-            } => {
-                self.changes = changes;
-                self.on_state(state, cause);
-            }
-        }
-        Ok(())
-    }
-
-    /// A datagram. Nothing in it can end the session: what is wrong is dropped and counted.
-    pub fn handle_datagram(&mut self, now: Stamp, bytes: &[u8]) {
-        match RobotDatagram::decode(bytes) {
-            Ok(RobotDatagram::Ping { epoch, t1_us }) if epoch == self.epoch => {
-                let t_us = now.0 / 1000;
-                self.datagram(&OperatorDatagram::Pong {
-                    epoch,
-                    t1_us,
-                    t2_us: t_us,
-                    t3_us: t_us,
-                });
-            }
-            Ok(RobotDatagram::Telemetry(telemetry)) if telemetry.epoch == self.epoch => {
-                if let Activity::Mirror(mirror) = &mut self.activity
-                    && telemetry.engagement == self.engagement
-                {
-                    mirror.acknowledge(telemetry.path_frontier);
-                }
-                if telemetry.delay_ms > 0 {
-                    let delay_s = f64::from(telemetry.delay_ms) * 1e-3;
-                    self.delay_s += if self.delay_s == 0.0 {
-                        delay_s
-                    } else {
-                        0.1 * (delay_s - self.delay_s)
-                    };
-                }
-                self.events.push_back(Event::Telemetry(Box::new(telemetry)));
-            }
-            _ => self.counters.dropped += 1,
-        }
     }
 
     /// The hand, live. Samples out of order or not finite are dropped and counted.
@@ -590,37 +360,6 @@ impl Session {
             bytes: datagram.encode(),
             motion: true,
         });
-    }
-
-    fn on_info(&mut self, info: Info) {
-        self.state = info.state;
-        let held = info.model;
-        self.info = Some(info);
-        match &self.skill {
-            Some(skill) if held != Some(skill.id().0) => {
-                let (id, bytes) = (skill.id().0, skill.to_bytes().to_vec());
-                self.control(&OperatorControl::Model { id, bytes });
-            }
-            _ => {
-                self.model_stored = self.skill.is_some();
-                self.events.push_back(Event::Ready);
-            }
-        }
-    }
-
-    fn on_state(&mut self, state: RobotState, cause: Cause) {
-        self.state = state;
-        match state {
-            RobotState::Stopped => {
-                self.next_stop = None;
-                self.activity = Activity::Nothing;
-            }
-            // The robot let go by itself: the clutch must be pressed again.
-            RobotState::Holding => self.activity = Activity::Nothing,
-            RobotState::Ready if cause == Cause::PlanFinished => self.activity = Activity::Nothing,
-            _ => {}
-        }
-        self.events.push_back(Event::State(state, cause));
     }
 
     fn request(&mut self, now: Stamp, drive: Drive) {

@@ -5,6 +5,11 @@ use telemime_protocol::checkpoint::select;
 use telemime_protocol::skill::example;
 use telemime_protocol::wire::v1::{ModelId, Motion};
 
+use telemime_protocol::skill::Stats;
+use telemime_protocol::wire::DecodeError;
+use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::v1::{Cause, RobotControl, RobotDatagram, Telemetry};
+
 use super::*;
 
 mod commands;

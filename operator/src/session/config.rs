@@ -1,0 +1,72 @@
+//! What a session is set to, and what it is fed.
+
+use nalgebra::{UnitQuaternion, Vector3};
+use telemime_protocol::skill::Stats;
+use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::v1::Info;
+
+/// How far the robot's prediction may be off before the operator speaks.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum FutureBound {
+    /// A distance, m.
+    Absolute(f64),
+    /// A multiple of the predicted standard deviation.
+    Relative(f64),
+}
+
+/// What a session is set to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SessionConfig {
+    /// The operator speaks at least this often, s.
+    pub max_silence_s: f64,
+    /// Two motions are at least this far apart, s, however fast the samples come.
+    pub min_interval_s: f64,
+    /// For how long each message authorises motion, s.
+    pub lease_s: f64,
+    /// ε_future.
+    pub future_bound: FutureBound,
+    /// ε_path, m; `None` is 2 % of the skill's reach.
+    pub path_bound_m: Option<f64>,
+    /// Prediction gain κ in [0, 1].
+    pub gain: f64,
+    /// Tip metres per hand metre; `None` derives it from the demonstrations and the arm's limits.
+    pub scale: Option<f64>,
+    /// Hand axes to the robot's base axes.
+    pub rotation: UnitQuaternion<f64>,
+}
+
+impl Default for SessionConfig {
+    fn default() -> Self {
+        Self {
+            max_silence_s: 0.2,
+            min_interval_s: 0.01,
+            lease_s: 0.65,
+            future_bound: FutureBound::Relative(0.6),
+            path_bound_m: None,
+            gain: 1.0,
+            scale: None,
+            rotation: UnitQuaternion::identity(),
+        }
+    }
+}
+
+/// The hand at one moment.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HandSample {
+    /// When it is valid.
+    pub t: Stamp,
+    /// Position, m.
+    pub x: Vector3<f64>,
+    /// Made up, so that a recording begins at rest: followed like any other, and counted apart.
+    pub resting: bool,
+}
+
+/// The largest scale at which the demonstrated motion stays within 0.8 of the arm's speed and
+/// acceleration, and within its reach; never above 1 (driving.md §2).
+pub fn default_scale(stats: &Stats, info: &Info) -> f64 {
+    let within = |limit: f32, demonstrated: f64| f64::from(limit) / demonstrated.max(1e-6);
+    let speed = 0.8 * within(info.speed_m_s, stats.speed95_m_s);
+    let acceleration = 0.8 * within(info.accel_m_s2, stats.acceleration95_m_s2);
+    let reach = within(info.radius_m, stats.reach_m);
+    speed.min(acceleration).min(reach).clamp(1e-3, 1.0)
+}

@@ -1,0 +1,147 @@
+//! What the robot says, and what it changes.
+
+use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::DecodeError;
+use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::v1::{
+    Cause, Drive, Info, Message, OperatorControl, OperatorDatagram, Refusal, RobotControl,
+    RobotDatagram, RobotState,
+};
+
+use super::{Activity, Counters, Event, Session};
+
+impl Session {
+    /// A frame from the control stream.
+    ///
+    /// # Errors
+    /// [`DecodeError`] for a frame that may not be ignored; the session is then over.
+    pub fn handle_control(&mut self, now: Stamp, frame: &Frame) -> Result<(), DecodeError> {
+        let message = match RobotControl::decode(&frame.payload) {
+            Ok(message) => message,
+            Err(_) if frame.ignorable => return Ok(()),
+            Err(e) => return Err(e),
+        };
+        match message {
+            RobotControl::Info(info) => self.on_info(info),
+            RobotControl::ModelStored { id } => {
+                if self.skill.as_ref().is_some_and(|skill| skill.id().0 == id) && !self.model_stored
+                {
+                    self.model_stored = true;
+                    self.events.push_back(Event::Ready);
+                }
+            }
+            RobotControl::PlanStored { id } => {
+                if let Activity::Play {
+                    plan,
+                    engaged: engaged @ false,
+                } = &mut self.activity
+                    && *plan == id
+                {
+                    *engaged = true;
+                    self.request(now, Drive::Play { plan: id });
+                    self.last_sent = now;
+                }
+            }
+            RobotControl::Engaged {
+                engagement,
+                t_us,
+                hand_m,
+                tip_m,
+            } => {
+                self.before = None;
+                self.events.push_back(Event::Engaged {
+                    engagement,
+                    t_us,
+                    hand_m,
+                    tip_m,
+                });
+            }
+            RobotControl::Refused { reason } => {
+                if let (Refusal::Diverged, Activity::Mirror(mirror)) = (reason, &mut self.activity)
+                {
+                    mirror.go_without_model();
+                } else {
+                    self.activity = Activity::Nothing;
+                    // What was sent for nothing is not what following took.
+                    if let Some(before) = self.before.take() {
+                        let dropped = self.counters.dropped;
+                        self.counters = Counters { dropped, ..before };
+                    }
+                }
+                self.events.push_back(Event::Refused(reason));
+            }
+            RobotControl::State {
+                state,
+                cause,
+                changes,
+            } => {
+                self.changes = changes;
+                self.on_state(state, cause);
+            }
+        }
+        Ok(())
+    }
+
+    /// A datagram. Nothing in it can end the session: what is wrong is dropped and counted.
+    pub fn handle_datagram(&mut self, now: Stamp, bytes: &[u8]) {
+        match RobotDatagram::decode(bytes) {
+            Ok(RobotDatagram::Ping { epoch, t1_us }) if epoch == self.epoch => {
+                let t_us = now.0 / 1000;
+                self.datagram(&OperatorDatagram::Pong {
+                    epoch,
+                    t1_us,
+                    t2_us: t_us,
+                    t3_us: t_us,
+                });
+            }
+            Ok(RobotDatagram::Telemetry(telemetry)) if telemetry.epoch == self.epoch => {
+                if let Activity::Mirror(mirror) = &mut self.activity
+                    && telemetry.engagement == self.engagement
+                {
+                    mirror.acknowledge(telemetry.path_frontier);
+                }
+                if telemetry.delay_ms > 0 {
+                    let delay_s = f64::from(telemetry.delay_ms) * 1e-3;
+                    self.delay_s += if self.delay_s == 0.0 {
+                        delay_s
+                    } else {
+                        0.1 * (delay_s - self.delay_s)
+                    };
+                }
+                self.events.push_back(Event::Telemetry(Box::new(telemetry)));
+            }
+            _ => self.counters.dropped += 1,
+        }
+    }
+
+    fn on_info(&mut self, info: Info) {
+        self.state = info.state;
+        let held = info.model;
+        self.info = Some(info);
+        match &self.skill {
+            Some(skill) if held != Some(skill.id().0) => {
+                let (id, bytes) = (skill.id().0, skill.to_bytes().to_vec());
+                self.control(&OperatorControl::Model { id, bytes });
+            }
+            _ => {
+                self.model_stored = self.skill.is_some();
+                self.events.push_back(Event::Ready);
+            }
+        }
+    }
+
+    fn on_state(&mut self, state: RobotState, cause: Cause) {
+        self.state = state;
+        match state {
+            RobotState::Stopped => {
+                self.next_stop = None;
+                self.activity = Activity::Nothing;
+            }
+            // The robot let go by itself: the clutch must be pressed again.
+            RobotState::Holding => self.activity = Activity::Nothing,
+            RobotState::Ready if cause == Cause::PlanFinished => self.activity = Activity::Nothing,
+            _ => {}
+        }
+        self.events.push_back(Event::State(state, cause));
+    }
+}

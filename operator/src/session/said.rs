@@ -1,0 +1,67 @@
+//! What a session says: bytes to send, events, counts.
+
+use telemime_protocol::wire::v1::{Cause, Refusal, RobotState, Telemetry};
+
+/// What a session wants sent.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Output {
+    /// A message for the control stream, not yet framed.
+    Control(Vec<u8>),
+    /// A datagram.
+    Datagram {
+        /// Its bytes.
+        bytes: Vec<u8>,
+        /// Whether it carries motion (the others keep time).
+        motion: bool,
+    },
+}
+
+/// What has happened.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Event {
+    /// The robot has introduced itself, and holds the model.
+    Ready,
+    /// The arm follows.
+    Engaged {
+        /// Which engagement.
+        engagement: u32,
+        /// When, µs on the session clock as the robot estimates it.
+        t_us: i64,
+        /// The hand position that corresponds to `tip_m`, m.
+        hand_m: [f32; 3],
+        /// The tip at that instant, m.
+        tip_m: [f32; 3],
+    },
+    /// A request was declined.
+    Refused(Refusal),
+    /// The robot's state changed.
+    State(RobotState, Cause),
+    /// News of the robot.
+    Telemetry(Box<Telemetry>),
+}
+
+/// What the session counts.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Samples taken from the request that was granted to the release, those made up at rest left out.
+    pub samples: u32,
+    /// Those at rest.
+    pub rest_samples: u32,
+    /// Motions and goes sent, from that request on.
+    pub messages: u32,
+    /// Path knots made.
+    pub knots: u32,
+    /// Datagrams dropped.
+    pub dropped: u32,
+}
+
+impl Counters {
+    /// Adds another session's counts.
+    pub fn add(&mut self, other: Self) {
+        self.samples += other.samples;
+        self.rest_samples += other.rest_samples;
+        self.messages += other.messages;
+        self.knots += other.knots;
+        self.dropped += other.dropped;
+    }
+}
