@@ -198,6 +198,55 @@ fn stop_ends_at_rest_and_nonsense_is_survived() {
     assert!(tip.iter().all(|x| x.is_finite()));
 }
 
+/// Targets that jump about the edge of the workspace, stay for a time and jump again: the largest speed and acceleration of the joints' reference and
+/// of the simulated arm, each at the tip.
+fn jumps(seed: u64, every: usize, radius: f64) -> [(f64, f64); 2] {
+    let mut rig = rig(&ControlConfig::default());
+    let mut state = seed;
+    let mut unit = || {
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as f64 / (1_u64 << 30) as f64 - 1.0
+    };
+    let mut kinematics = Kinematics::new();
+    let mut tips: [Vec<Vector3<f64>>; 2] = Default::default();
+    let mut target = rig.start;
+    for tick in 0..8000 {
+        if tick % every == 0 {
+            let direction = Vector3::from_fn(|_, _| unit());
+            target = rig.start + direction.normalize() * radius;
+        }
+        let out = rig.follow(target);
+        kinematics.update(&rig.arm, &out.q_ref);
+        tips[0].push(kinematics.tip());
+        tips[1].push(out.tip);
+    }
+    tips.map(|tip| {
+        let speeds: Vec<_> = tip.windows(2).map(|w| (w[1] - w[0]) / DT).collect();
+        let harder = speeds.windows(2).map(|w| ((w[1] - w[0]) / DT).norm());
+        (
+            speeds.iter().map(|v| v.norm()).fold(0.0, f64::max),
+            harder.fold(0.0, f64::max),
+        )
+    })
+}
+
+#[test]
+fn limits_hold_at_the_tip_wherever_the_target_jumps() {
+    let limits = *rig(&ControlConfig::default()).controller.limits();
+    for (seed, every, radius) in [(1, 400, 0.2), (2, 250, 0.2), (3, 120, 0.2), (4, 600, 0.1)] {
+        let [reference, arm] = jumps(seed, every, radius);
+        println!(
+            "every {every} ms, {radius} m: reference {reference:?}, arm {arm:?} of {limits:?}"
+        );
+        for ((speed, acceleration), margin) in [(reference, 1.05), (arm, 1.10)] {
+            assert!(speed <= limits.v_max * margin, "{speed} m/s");
+            assert!(acceleration <= limits.a_max * margin, "{acceleration} m/s²");
+        }
+    }
+}
+
 #[test]
 fn reset_starts_at_the_measured_posture_without_a_jolt() {
     let mut rig = rig(&ControlConfig::default());
