@@ -8,7 +8,7 @@ use telemime_sim::arm::{ArmError, ArmModel, Joints, LoadOptions, Plant, PlantErr
 
 use crate::control::{ControlConfig, ControlError, Controller, home_posture, workspace_radius};
 use crate::safety::SafetyConfig;
-use crate::servo::{Core, CoreConfig, Rings};
+use crate::servo::{Core, CoreConfig, Rings, Workspace};
 
 /// Which arm, and how it starts.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -72,8 +72,8 @@ pub struct Rig {
     pub arm: Arc<ArmModel>,
     /// Where it starts, rad or m.
     pub home: Joints,
-    /// The tip may go this far from where it engages, m.
-    pub radius_m: f64,
+    /// Where the tip may be.
+    pub workspace: Workspace,
     controller: Controller,
     plant: Plant,
     config: CoreConfig,
@@ -109,18 +109,21 @@ impl Rig {
         let arm = Arc::new(arm);
         let controller = Controller::new(arm.clone(), &options.control, &home)
             .map_err(|source| RigError::Control { urdf, source })?;
-        let radius_m = workspace_radius(&arm, &home);
+        let workspace = Workspace {
+            home_m: controller.reference().p,
+            radius_m: workspace_radius(&arm, &home),
+        };
         let config = CoreConfig {
             safety: options.safety,
             tick_s: options.control.dt_s,
             lag_s: controller.lag_s(),
-            radius_m,
+            workspace,
         };
         Ok(Self {
             plant: Plant::new(arm.clone(), &home)?,
             arm,
             home,
-            radius_m,
+            workspace,
             controller,
             config,
         })
@@ -138,7 +141,7 @@ impl Rig {
             joints: self.arm.dof() as u8,
             speed_m_s: limits.v_max as f32,
             accel_m_s2: limits.a_max as f32,
-            radius_m: self.radius_m as f32,
+            radius_m: self.workspace.radius_m as f32,
             lag_s: self.config.lag_s as f32,
             model: None,
             state: RobotState::Idle,
