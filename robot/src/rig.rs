@@ -10,6 +10,9 @@ use crate::control::{ControlConfig, ControlError, Controller, home_posture, work
 use crate::safety::SafetyConfig;
 use crate::servo::{Core, CoreConfig, Rings, Workspace};
 
+/// A workspace with a smaller radius is refused, m.
+const LEAST_RADIUS_M: f64 = 0.01;
+
 /// Which arm, and how it starts.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct RigOptions {
@@ -60,6 +63,17 @@ pub enum RigError {
         /// Why.
         source: ControlError,
     },
+    /// The tip has no room around the start posture.
+    #[error(
+        "{urdf}: from the start posture the tip can go only {radius_m:.3} m in some direction before a joint's end, a singular posture or the floor; \
+         choose another start posture or tip link"
+    )]
+    NoRoom {
+        /// The file.
+        urdf: String,
+        /// How far, m.
+        radius_m: f64,
+    },
     /// The plant cannot start there.
     #[error(transparent)]
     Plant(#[from] PlantError),
@@ -107,11 +121,20 @@ impl Rig {
             })?,
         };
         let arm = Arc::new(arm);
-        let controller = Controller::new(arm.clone(), &options.control, &home)
-            .map_err(|source| RigError::Control { urdf, source })?;
+        let controller =
+            Controller::new(arm.clone(), &options.control, &home).map_err(|source| {
+                RigError::Control {
+                    urdf: urdf.clone(),
+                    source,
+                }
+            })?;
+        let radius_m = workspace_radius(&arm, &home);
+        if radius_m < LEAST_RADIUS_M {
+            return Err(RigError::NoRoom { urdf, radius_m });
+        }
         let workspace = Workspace {
             home_m: controller.reference().p,
-            radius_m: workspace_radius(&arm, &home),
+            radius_m,
         };
         let config = CoreConfig {
             safety: options.safety,
@@ -171,5 +194,23 @@ impl Rig {
             self.plant.clone(),
             rings,
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_start_without_room_is_refused() {
+        let options = RigOptions {
+            start: Some(vec![0.0, 0.0, 0.0, -0.1, 0.0, 0.1, 0.0]),
+            ..RigOptions::default()
+        };
+        let error = Rig::load(&options).unwrap_err();
+        assert!(
+            matches!(error, RigError::NoRoom { radius_m, .. } if radius_m < LEAST_RADIUS_M),
+            "{error}"
+        );
     }
 }

@@ -3,7 +3,7 @@
 use nalgebra::{Matrix6, SMatrix, Vector2, Vector3};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
-use telemime_sim::arm::{ArmModel, Dynamics, Joint, Joints, Kinematics, MAX_JOINTS};
+use telemime_sim::arm::{ArmModel, Dynamics, Joint, JointKind, Joints, Kinematics, MAX_JOINTS};
 
 use super::ControlError;
 use super::ik::{largest_share, min_eigenvalue, orientation_error, resolve};
@@ -158,11 +158,25 @@ fn unit(rng: &mut Xoshiro256PlusPlus) -> f64 {
     (rng.next_u64() >> 11) as f64 * (1.0 / (1_u64 << 53) as f64)
 }
 
-/// The part of a joint's range that is searched: at most a turn (half a metre either way for an unlimited slide), around its middle.
+/// The part of a joint's range that is searched: at most a turn around its middle; of a slide all, or half a metre either way if it is unlimited.
 fn window(joint: &Joint) -> (f64, f64) {
     let mid = joint.mid();
-    let reach = core::f64::consts::PI;
+    let reach = match joint.kind {
+        JointKind::Revolute => core::f64::consts::PI,
+        JointKind::Prismatic if joint.is_limited() => f64::INFINITY,
+        JointKind::Prismatic => 0.5,
+    };
     (joint.lower.max(mid - reach), joint.upper.min(mid + reach))
+}
+
+/// The farthest that is tried, m: the stretched chain, and every slide's travel.
+fn most_travel_m(arm: &ArmModel) -> f64 {
+    let slides = arm
+        .joints()
+        .iter()
+        .filter(|j| j.kind == JointKind::Prismatic);
+    let travel = slides.map(window).map(|(lower, upper)| upper - lower);
+    arm.chain_length_m() + travel.sum::<f64>()
 }
 
 struct Search<'a> {
@@ -242,7 +256,7 @@ impl Search<'_> {
 /// keeping its orientation as far as the arm can, its joints within limits, its position Jacobian's smallest singular value above 0.3 of that at
 /// home, and the tip 2 cm above the floor (if it starts there). In steps of 5 mm.
 pub fn workspace_radius(arm: &ArmModel, home: &Joints) -> f64 {
-    let mut radius = arm.chain_length_m();
+    let mut radius = most_travel_m(arm);
     for x in -1..=1 {
         for y in -1..=1 {
             for z in -1..=1 {

@@ -316,3 +316,44 @@ fn arms_that_cannot_are_refused() {
         Err(ControlError::Singular)
     );
 }
+
+/// Three slides of a metre, the last one upright, without any length between them.
+fn gantry() -> ArmModel {
+    let mut urdf = String::from(r#"<robot name="gantry"><link name="l0"/>"#);
+    for (i, axis) in ["1 0 0", "0 1 0", "0 0 1"].iter().enumerate() {
+        urdf += &format!(
+            r#"<link name="l{child}"><inertial><mass value="2"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+            <joint name="j{child}" type="prismatic"><parent link="l{i}"/><child link="l{child}"/><axis xyz="{axis}"/>
+            <limit lower="0" upper="1" velocity="1" effort="200"/></joint>"#,
+            child = i + 1,
+        );
+    }
+    ArmModel::from_urdf(&(urdf + "</robot>"), &LoadOptions::default()).unwrap()
+}
+
+#[test]
+fn a_gantry_of_slides_has_a_workspace_and_moves_in_it() {
+    let arm = Arc::new(gantry());
+    let home = home_posture(&arm);
+    let radius = workspace_radius(&arm, &home);
+    // Down to 2 cm above the floor, in steps of 5 mm.
+    assert!(
+        (0.47..0.485).contains(&radius),
+        "{radius} m around {home:?}"
+    );
+    let mut controller =
+        Controller::new(Arc::clone(&arm), &ControlConfig::default(), &home).unwrap();
+    let mut plant = Plant::new(Arc::clone(&arm), &home).unwrap();
+    let target = Vector3::new(0.7, 0.3, 0.2);
+    let mut tip = Vector3::zeros();
+    for _ in 0..3000 {
+        let demand = Demand::Follow {
+            target,
+            speed_scale: 1.0,
+        };
+        let out = controller.tick(demand, plant.q(), plant.qd());
+        plant.step(&out.tau, DT);
+        tip = out.tip;
+    }
+    assert!((tip - target).norm() < 1e-3, "{tip}");
+}
