@@ -218,7 +218,7 @@ impl Controller {
         }
         let mut q = Joints::zeros();
         q.as_mut_slice()[..arm.dof()].copy_from_slice(&q0.as_slice()[..arm.dof()]);
-        let limits = config.limits.lowered(&arm, &q)?;
+        let limits = config.limits.lowered(&arm, &q, config.dt_s)?;
         let accelerations = joint_accelerations(&arm, &q)?;
         let ik_config = IkConfig {
             position_gain: 0.1 / config.dt_s,

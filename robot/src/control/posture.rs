@@ -25,12 +25,12 @@ pub struct CartesianLimits {
 impl CartesianLimits {
     /// These limits, lowered to what the joints allow at `q` in the worst direction, moving by the pseudo-inverse J⁺ of the position Jacobian:
     /// speed to min q̇ᵢ ⁄ ‖row i of J⁺‖; acceleration to the same of the URDF's acceleration limits (at most 30 rad/s²) and to
-    /// min (0.8·τᵢ − |gᵢ|) ⁄ ‖row i of M J⁺‖. Away from `q` the joints may allow less: there the inverse kinematics slows.
+    /// min (0.8·τᵢ − |gᵢ|) ⁄ ‖row i of M J⁺‖, and to what the jerk can turn around, in ticks of `dt_s`, within 0.8 of the speed. Away from `q` the joints may allow less: there the inverse kinematics slows.
     ///
     /// # Errors
     /// [`ControlError::TooWeak`] if a joint cannot carry the arm at `q`, [`ControlError::Singular`] if the tip cannot move in every
     /// direction there.
-    pub fn lowered(self, arm: &ArmModel, q: &Joints) -> Result<Self, ControlError> {
+    pub fn lowered(self, arm: &ArmModel, q: &Joints, dt_s: f64) -> Result<Self, ControlError> {
         let mut dynamics = Dynamics::new();
         dynamics.update(arm, q);
         let jacobian = dynamics.kinematics().jacobian();
@@ -53,6 +53,10 @@ impl CartesianLimits {
                 .min(joint.acceleration.min(ACCELERATION_CAP) / rate)
                 .min(headroom[i] / torques.row(i).norm());
         }
+        // a²/j + a·dt = 0.8·v, solved for a.
+        let j = limits.j_max;
+        let turned = 0.5 * j * ((dt_s * dt_s + 3.2 * limits.v_max / j).sqrt() - dt_s);
+        limits.a_max = limits.a_max.min(turned);
         Ok(limits)
     }
 }

@@ -357,3 +357,23 @@ fn a_gantry_of_slides_has_a_workspace_and_moves_in_it() {
     }
     assert!((tip - target).norm() < 1e-3, "{tip}");
 }
+
+#[test]
+fn a_slow_arm_is_driven_gently() {
+    // At a hundredth of the built-in arm's joint speeds, full acceleration could not be turned around in time.
+    let mut urdf = default_urdf().to_owned();
+    for speed in ["2.4", "3"] {
+        assert!(urdf.contains(&format!(r#"velocity="{speed}""#)));
+        urdf = urdf.replace(&format!(r#"velocity="{speed}""#), r#"velocity="0.02""#);
+    }
+    let arm = Arc::new(ArmModel::from_urdf(&urdf, &LoadOptions::default()).unwrap());
+    let home = home_posture(&arm);
+    let controller = Controller::new(Arc::clone(&arm), &ControlConfig::default(), &home).unwrap();
+    let CartesianLimits {
+        v_max,
+        a_max,
+        j_max,
+    } = *controller.limits();
+    assert!(v_max < 0.02 && a_max > 1.0, "{v_max} m/s, {a_max} m/s²");
+    assert!(a_max * a_max / j_max + a_max * DT <= 0.81 * v_max);
+}
