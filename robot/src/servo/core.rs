@@ -171,7 +171,7 @@ pub struct CoreConfig {
     pub safety: SafetyConfig,
     /// Period, s.
     pub tick_s: f64,
-    /// From predicted target to tip, s: 3/ω and the arm's dead time.
+    /// From predicted target to tip, s: the filter's 3/ω, since the simulated arm has no dead time.
     pub lag_s: f64,
     /// Where the tip may be.
     pub workspace: Workspace,
