@@ -225,7 +225,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
             arm: rig.arm.name().to_owned(),
             joints: rig.arm.dof(),
             lag_s: rig.lag_s(),
-            radius_m: rig.radius_m,
+            radius_m: rig.workspace.radius_m,
         },
         || {
             format!(

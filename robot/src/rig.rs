@@ -8,7 +8,10 @@ use telemime_sim::arm::{ArmError, ArmModel, Joints, LoadOptions, Plant, PlantErr
 
 use crate::control::{ControlConfig, ControlError, Controller, home_posture, workspace_radius};
 use crate::safety::SafetyConfig;
-use crate::servo::{Core, CoreConfig, Rings};
+use crate::servo::{Core, CoreConfig, Rings, Workspace};
+
+/// A workspace with a smaller radius is refused, m.
+const LEAST_RADIUS_M: f64 = 0.01;
 
 /// Which arm, and how it starts.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -60,6 +63,17 @@ pub enum RigError {
         /// Why.
         source: ControlError,
     },
+    /// The tip has no room around the start posture.
+    #[error(
+        "{urdf}: from the start posture the tip can go only {radius_m:.3} m in some direction before a joint's end, a singular posture or the floor; \
+         choose another start posture or tip link"
+    )]
+    NoRoom {
+        /// The file.
+        urdf: String,
+        /// How far, m.
+        radius_m: f64,
+    },
     /// The plant cannot start there.
     #[error(transparent)]
     Plant(#[from] PlantError),
@@ -72,8 +86,8 @@ pub struct Rig {
     pub arm: Arc<ArmModel>,
     /// Where it starts, rad or m.
     pub home: Joints,
-    /// The tip may go this far from where it engages, m.
-    pub radius_m: f64,
+    /// Where the tip may be.
+    pub workspace: Workspace,
     controller: Controller,
     plant: Plant,
     config: CoreConfig,
@@ -107,20 +121,32 @@ impl Rig {
             })?,
         };
         let arm = Arc::new(arm);
-        let controller = Controller::new(arm.clone(), &options.control, &home)
-            .map_err(|source| RigError::Control { urdf, source })?;
+        let controller =
+            Controller::new(arm.clone(), &options.control, &home).map_err(|source| {
+                RigError::Control {
+                    urdf: urdf.clone(),
+                    source,
+                }
+            })?;
         let radius_m = workspace_radius(&arm, &home);
+        if radius_m < LEAST_RADIUS_M {
+            return Err(RigError::NoRoom { urdf, radius_m });
+        }
+        let workspace = Workspace {
+            home_m: controller.reference().p,
+            radius_m,
+        };
         let config = CoreConfig {
             safety: options.safety,
             tick_s: options.control.dt_s,
             lag_s: controller.lag_s(),
-            radius_m,
+            workspace,
         };
         Ok(Self {
             plant: Plant::new(arm.clone(), &home)?,
             arm,
             home,
-            radius_m,
+            workspace,
             controller,
             config,
         })
@@ -138,7 +164,7 @@ impl Rig {
             joints: self.arm.dof() as u8,
             speed_m_s: limits.v_max as f32,
             accel_m_s2: limits.a_max as f32,
-            radius_m: self.radius_m as f32,
+            radius_m: self.workspace.radius_m as f32,
             lag_s: self.config.lag_s as f32,
             model: None,
             state: RobotState::Idle,
@@ -168,5 +194,23 @@ impl Rig {
             self.plant.clone(),
             rings,
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_start_without_room_is_refused() {
+        let options = RigOptions {
+            start: Some(vec![0.0, 0.0, 0.0, -0.1, 0.0, 0.1, 0.0]),
+            ..RigOptions::default()
+        };
+        let error = Rig::load(&options).unwrap_err();
+        assert!(
+            matches!(error, RigError::NoRoom { radius_m, .. } if radius_m < LEAST_RADIUS_M),
+            "{error}"
+        );
     }
 }

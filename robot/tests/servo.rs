@@ -16,6 +16,8 @@ use telemime_robot::servo::{
 
 const MS: i64 = 1_000_000;
 
+const HAND_M: Vector3<f64> = Vector3::new(0.1, 0.2, 2.0);
+
 struct Bench {
     core: Core,
     handle: Handle,
@@ -27,7 +29,7 @@ fn ticket(number: u32) -> Ticket {
 }
 
 fn forecast() -> Forecast {
-    let hand = HandState::first(Stamp::ZERO, Vector3::new(0.1, 0.2, 2.0));
+    let hand = HandState::first(Stamp::ZERO, HAND_M);
     Forecast::constant_velocity(&hand, &Params::DEFAULT)
 }
 
@@ -181,4 +183,39 @@ fn what_belongs_to_another_engagement_moves_nothing() {
         RobotState::Holding,
         "another's lease was extended"
     );
+}
+
+#[test]
+fn engaging_again_and_again_does_not_walk_out_of_the_workspace() {
+    let mut bench = Bench::new();
+    let workspace = Rig::load(&RigOptions::default()).unwrap().workspace;
+    let down = Vector3::new(0.0, 0.0, -0.15);
+    let mut farthest_m = 0.0_f64;
+    for number in 1..=3 {
+        let began = bench.now_ms;
+        bench.engage(number, 1.0);
+        for ms in began + 1..=began + 2000 {
+            let report = bench.tick_at(ms);
+            assert_eq!(report.engagement, ticket(number));
+            farthest_m = farthest_m.max((report.tip_m - workspace.home_m).norm());
+            if ms - began < 1500 {
+                let (lease, valid_at) = (bench.lease(), Mono(ms * MS));
+                let hand = HandState::first(Stamp::ZERO, HAND_M + down);
+                bench.order(Order::Track {
+                    ticket: ticket(number),
+                    forecast: Forecast::constant_velocity(&hand, &Params::DEFAULT),
+                    valid_at,
+                    lease,
+                });
+            } else {
+                bench.order(Order::Release(ticket(number)));
+            }
+        }
+        let report = bench.tick_at(began + 2001);
+        assert!(!report.moving);
+        let clipped = f64::from(number) * -down.z > workspace.radius_m;
+        assert_eq!(report.clamps > 1000, clipped, "{} ticks", report.clamps);
+    }
+    let over_mm = (farthest_m - workspace.radius_m) * 1e3;
+    assert!((-1.0..1.0).contains(&over_mm), "{over_mm} mm beyond");
 }

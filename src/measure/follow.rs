@@ -37,8 +37,8 @@ pub fn follow(
     for tick in 0..ticks {
         let since_s = tick as f64 * tick_s;
         let hand_m = demanded(from_s + since_s).unwrap_or(mapping.hand_m);
-        let (placed, out_of_reach) = mapping.place(hand_m, rig.radius_m);
-        let target = mapping.tip_m + (placed - mapping.tip_m) * ramp(since_s / RAMP_S);
+        let eased = ramp(since_s / RAMP_S);
+        let (target, out_of_reach) = mapping.place(hand_m, &rig.workspace, eased);
         let output = controller.tick(
             Demand::Follow {
                 target,

@@ -170,7 +170,7 @@ pub struct Info {
     pub speed_m_s: f32,
     /// Largest tip acceleration, m/s².
     pub accel_m_s2: f32,
-    /// The tip may go this far from where it engages, m.
+    /// The tip may go this far from its place in the robot's start posture, m.
     pub radius_m: f32,
     /// From predicted target to tip, s: what the horizon adds to the age of the information.
     pub lag_s: f32,

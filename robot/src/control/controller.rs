@@ -12,7 +12,7 @@ use super::{
 };
 
 /// The filter's reference may lead the joints' reference by this much, m; beyond, the arm cannot follow and the filter waits for it.
-const LEASH_M: f64 = 0.02;
+const LEASH_M: f64 = 0.005;
 
 /// Bandwidth, limits and gains of a [`Controller`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -113,7 +113,7 @@ pub enum Demand {
 pub struct Clamps {
     /// The filter was at a limit of speed, acceleration or jerk.
     pub filter: bool,
-    /// The joints' step was slowed to their speed or acceleration limits.
+    /// The joints' step was slowed to the speed or acceleration limits of the joints or the tip.
     pub slowed: bool,
     /// The arm is near a singular posture.
     pub singular: bool,
@@ -218,10 +218,12 @@ impl Controller {
         }
         let mut q = Joints::zeros();
         q.as_mut_slice()[..arm.dof()].copy_from_slice(&q0.as_slice()[..arm.dof()]);
-        let limits = config.limits.lowered(&arm, &q)?;
+        let limits = config.limits.lowered(&arm, &q, config.dt_s)?;
         let accelerations = joint_accelerations(&arm, &q)?;
         let ik_config = IkConfig {
             position_gain: 0.1 / config.dt_s,
+            v_max: limits.v_max,
+            a_max: limits.a_max,
             orientation_gain: config.orientation_gain,
             posture_gain: config.posture_gain,
             dt_s: config.dt_s,

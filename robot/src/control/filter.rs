@@ -235,7 +235,7 @@ impl LimitedFilter {
 }
 
 /// `x` shortened to length `max`, and whether it was.
-fn limited(x: Vector3<f64>, max: f64) -> (Vector3<f64>, bool) {
+pub(super) fn limited(x: Vector3<f64>, max: f64) -> (Vector3<f64>, bool) {
     let norm = x.norm();
     if norm > max {
         (x * (max / norm), true)

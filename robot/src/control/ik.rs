@@ -5,16 +5,25 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector3};
 use telemime_sim::arm::{ArmModel, Jacobian, Joints, Kinematics, MAX_JOINTS};
 
+use super::filter::limited;
+
 /// How many times a step is resolved again without the joints that are at the end of their range.
 const MAX_DROPPED: usize = 3;
+
+/// What the tip may accelerate by beyond the filter's limit, as a share of it: without it a lag that arises under full acceleration would stay.
+const RESERVE: f64 = 0.04;
 
 type Rows = SMatrix<f64, 3, MAX_JOINTS>;
 
 /// Gains of the inverse kinematics.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct IkConfig {
-    /// How fast a position error of the joint reference is closed, 1/s.
+    /// How fast a small position error of the joint reference is closed, 1/s; a larger one as a 25th of `a_max` can brake.
     pub position_gain: f64,
+    /// Largest speed of the reference's tip, m/s.
+    pub v_max: f64,
+    /// Largest acceleration of the reference's tip, m/s², but for a 25th that is kept to close position errors.
+    pub a_max: f64,
     /// How fast an orientation error is closed where the arm has joints to spare for it, 1/s.
     pub orientation_gain: f64,
     /// How fast the remaining freedom returns to the rest posture, 1/s.
@@ -37,7 +46,7 @@ pub struct JointReference {
 /// What a step ran into; bit `i` stands for joint `i`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct JointStep {
-    /// The step was slowed along its path to keep joint speeds or accelerations within limits.
+    /// The step was slowed along its path to keep the joints or the tip within their limits of speed and acceleration.
     pub slowed: bool,
     /// The tip is near a singular posture: motion is damped.
     pub singular: bool,
@@ -135,6 +144,8 @@ pub(super) struct DifferentialIk {
     /// Share of the secondary tasks, faded so that stopping and starting them is no jolt.
     secondary_share: f64,
     reference: JointReference,
+    /// Of the reference's tip, m/s.
+    tip_velocity: Vector3<f64>,
     kinematics: Kinematics,
 }
 
@@ -158,6 +169,7 @@ impl DifferentialIk {
                 qd: Joints::zeros(),
                 qdd: Joints::zeros(),
             },
+            tip_velocity: Vector3::zeros(),
             kinematics: Kinematics::new(),
         };
         ik.reset(q);
@@ -172,6 +184,7 @@ impl DifferentialIk {
             qdd: Joints::zeros(),
         };
         self.secondary_share = 0.0;
+        self.tip_velocity = Vector3::zeros();
         self.kinematics.update(&self.arm, q);
         self.orientation = *self.kinematics.tip_rotation();
         self.kinematics.tip()
@@ -196,7 +209,8 @@ impl DifferentialIk {
         let error_m = p - self.kinematics.tip();
         let turn = orientation_error(self.kinematics.tip_rotation(), &self.orientation);
         let mut jacobian = self.kinematics.jacobian();
-        let tip_velocity = v + error_m * self.config.position_gain;
+        let linear: Rows = jacobian.fixed_rows::<3>(0).into();
+        let (tip_velocity, held) = self.tip_command(v, &error_m);
         let angular_velocity = turn * self.config.orientation_gain;
         let idle = (self.rest - ahead) * self.config.posture_gain;
         let epsilon = singular_below(&self.arm);
@@ -226,7 +240,10 @@ impl DifferentialIk {
         let wanted = primary + secondary * largest_share(&primary, &secondary, &lower, &upper);
         let most = self.accelerations * h;
         let change = wanted - qd;
-        let change_share = largest_share(&Joints::zeros(), &change, &-most, &most);
+        let coasting = linear * qd - self.tip_velocity;
+        let most_tip = (1.0 + RESERVE) * self.config.a_max * h * (1.0 + 1e-9);
+        let change_share = largest_share(&Joints::zeros(), &change, &-most, &most)
+            .min(share_within(&coasting, &(linear * change), most_tip));
         let mut next = qd + change * change_share;
         for i in 0..self.arm.dof() {
             // Slowing all joints alike for one joint's acceleration must not keep another from braking before its stop.
@@ -242,17 +259,36 @@ impl DifferentialIk {
                 at_limit |= 1 << i;
             }
         }
+        self.tip_velocity = linear * next;
         self.reference = JointReference {
             q: q_next,
             qd: next,
             qdd: (next - qd) / h,
         };
         JointStep {
-            slowed: primary_share < 1.0 || change_share < 1.0,
+            slowed: held || primary_share < 1.0 || change_share < 1.0,
             singular: sigma_min < epsilon,
             at_limit,
             error_m,
         }
+    }
+
+    /// The tip's next velocity: the filter's and what closes the position error, within the tip's own limits. Also whether those changed it.
+    fn tip_command(&self, v: &Vector3<f64>, error_m: &Vector3<f64>) -> (Vector3<f64>, bool) {
+        let IkConfig {
+            position_gain,
+            v_max,
+            a_max,
+            dt_s,
+            ..
+        } = self.config;
+        // Faster than this it could not be braked on top of a filter that brakes as hard as it may.
+        let closing = (2.0 * RESERVE * a_max * error_m.norm()).sqrt();
+        let (correction, _) = limited(error_m * position_gain, closing);
+        let (wanted, fast) = limited(v + correction, v_max);
+        let most = (1.0 + RESERVE) * a_max * dt_s;
+        let (change, hard) = limited(wanted - self.tip_velocity, most);
+        (self.tip_velocity + change, fast || hard)
     }
 
     /// Joints (bits) that `motion` would press against the end of their range.
@@ -291,6 +327,22 @@ pub(super) fn largest_share(base: &Joints, addend: &Joints, lower: &Joints, uppe
         }
     }
     share
+}
+
+/// The largest share in [0, 1] of `addend` that keeps |`base` + share·`addend`| within `radius`; 0 if there is none.
+fn share_within(base: &Vector3<f64>, addend: &Vector3<f64>, radius: f64) -> f64 {
+    let (a, b) = (addend.norm_squared(), base.dot(addend));
+    let c = base.norm_squared() - radius * radius;
+    if a + 2.0 * b + c <= 0.0 {
+        return 1.0;
+    }
+    // a > 0 here unless `base` itself is outside.
+    let root = (b * b - a * c).max(0.0).sqrt();
+    if a > 0.0 {
+        ((root - b) / a).clamp(0.0, 1.0)
+    } else {
+        0.0
+    }
 }
 
 #[cfg(test)]

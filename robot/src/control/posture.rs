@@ -3,7 +3,7 @@
 use nalgebra::{Matrix6, SMatrix, Vector2, Vector3};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
-use telemime_sim::arm::{ArmModel, Dynamics, Joint, Joints, Kinematics, MAX_JOINTS};
+use telemime_sim::arm::{ArmModel, Dynamics, Joint, JointKind, Joints, Kinematics, MAX_JOINTS};
 
 use super::ControlError;
 use super::ik::{largest_share, min_eigenvalue, orientation_error, resolve};
@@ -25,12 +25,12 @@ pub struct CartesianLimits {
 impl CartesianLimits {
     /// These limits, lowered to what the joints allow at `q` in the worst direction, moving by the pseudo-inverse J⁺ of the position Jacobian:
     /// speed to min q̇ᵢ ⁄ ‖row i of J⁺‖; acceleration to the same of the URDF's acceleration limits (at most 30 rad/s²) and to
-    /// min (0.8·τᵢ − |gᵢ|) ⁄ ‖row i of M J⁺‖. Away from `q` the joints may allow less: there the inverse kinematics slows.
+    /// min (0.8·τᵢ − |gᵢ|) ⁄ ‖row i of M J⁺‖, and to what the jerk can turn around, in ticks of `dt_s`, within 0.8 of the speed. Away from `q` the joints may allow less: there the inverse kinematics slows.
     ///
     /// # Errors
     /// [`ControlError::TooWeak`] if a joint cannot carry the arm at `q`, [`ControlError::Singular`] if the tip cannot move in every
     /// direction there.
-    pub fn lowered(self, arm: &ArmModel, q: &Joints) -> Result<Self, ControlError> {
+    pub fn lowered(self, arm: &ArmModel, q: &Joints, dt_s: f64) -> Result<Self, ControlError> {
         let mut dynamics = Dynamics::new();
         dynamics.update(arm, q);
         let jacobian = dynamics.kinematics().jacobian();
@@ -53,6 +53,10 @@ impl CartesianLimits {
                 .min(joint.acceleration.min(ACCELERATION_CAP) / rate)
                 .min(headroom[i] / torques.row(i).norm());
         }
+        // a²/j + a·dt = 0.8·v, solved for a.
+        let j = limits.j_max;
+        let turned = 0.5 * j * ((dt_s * dt_s + 3.2 * limits.v_max / j).sqrt() - dt_s);
+        limits.a_max = limits.a_max.min(turned);
         Ok(limits)
     }
 }
@@ -158,11 +162,25 @@ fn unit(rng: &mut Xoshiro256PlusPlus) -> f64 {
     (rng.next_u64() >> 11) as f64 * (1.0 / (1_u64 << 53) as f64)
 }
 
-/// The part of a joint's range that is searched: at most a turn (half a metre either way for an unlimited slide), around its middle.
+/// The part of a joint's range that is searched: at most a turn around its middle; of a slide all, or half a metre either way if it is unlimited.
 fn window(joint: &Joint) -> (f64, f64) {
     let mid = joint.mid();
-    let reach = core::f64::consts::PI;
+    let reach = match joint.kind {
+        JointKind::Revolute => core::f64::consts::PI,
+        JointKind::Prismatic if joint.is_limited() => f64::INFINITY,
+        JointKind::Prismatic => 0.5,
+    };
     (joint.lower.max(mid - reach), joint.upper.min(mid + reach))
+}
+
+/// The farthest that is tried, m: the stretched chain, and every slide's travel.
+fn most_travel_m(arm: &ArmModel) -> f64 {
+    let slides = arm
+        .joints()
+        .iter()
+        .filter(|j| j.kind == JointKind::Prismatic);
+    let travel = slides.map(window).map(|(lower, upper)| upper - lower);
+    arm.chain_length_m() + travel.sum::<f64>()
 }
 
 struct Search<'a> {
@@ -242,7 +260,7 @@ impl Search<'_> {
 /// keeping its orientation as far as the arm can, its joints within limits, its position Jacobian's smallest singular value above 0.3 of that at
 /// home, and the tip 2 cm above the floor (if it starts there). In steps of 5 mm.
 pub fn workspace_radius(arm: &ArmModel, home: &Joints) -> f64 {
-    let mut radius = arm.chain_length_m();
+    let mut radius = most_travel_m(arm);
     for x in -1..=1 {
         for y in -1..=1 {
             for z in -1..=1 {

@@ -198,6 +198,55 @@ fn stop_ends_at_rest_and_nonsense_is_survived() {
     assert!(tip.iter().all(|x| x.is_finite()));
 }
 
+/// Targets that jump about the edge of the workspace, stay for a time and jump again: the largest speed and acceleration of the joints' reference and
+/// of the simulated arm, each at the tip.
+fn jumps(seed: u64, every: usize, radius: f64) -> [(f64, f64); 2] {
+    let mut rig = rig(&ControlConfig::default());
+    let mut state = seed;
+    let mut unit = || {
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as f64 / (1_u64 << 30) as f64 - 1.0
+    };
+    let mut kinematics = Kinematics::new();
+    let mut tips: [Vec<Vector3<f64>>; 2] = Default::default();
+    let mut target = rig.start;
+    for tick in 0..8000 {
+        if tick % every == 0 {
+            let direction = Vector3::from_fn(|_, _| unit());
+            target = rig.start + direction.normalize() * radius;
+        }
+        let out = rig.follow(target);
+        kinematics.update(&rig.arm, &out.q_ref);
+        tips[0].push(kinematics.tip());
+        tips[1].push(out.tip);
+    }
+    tips.map(|tip| {
+        let speeds: Vec<_> = tip.windows(2).map(|w| (w[1] - w[0]) / DT).collect();
+        let harder = speeds.windows(2).map(|w| ((w[1] - w[0]) / DT).norm());
+        (
+            speeds.iter().map(|v| v.norm()).fold(0.0, f64::max),
+            harder.fold(0.0, f64::max),
+        )
+    })
+}
+
+#[test]
+fn limits_hold_at_the_tip_wherever_the_target_jumps() {
+    let limits = *rig(&ControlConfig::default()).controller.limits();
+    for (seed, every, radius) in [(1, 400, 0.2), (2, 250, 0.2), (3, 120, 0.2), (4, 600, 0.1)] {
+        let [reference, arm] = jumps(seed, every, radius);
+        println!(
+            "every {every} ms, {radius} m: reference {reference:?}, arm {arm:?} of {limits:?}"
+        );
+        for ((speed, acceleration), margin) in [(reference, 1.05), (arm, 1.10)] {
+            assert!(speed <= limits.v_max * margin, "{speed} m/s");
+            assert!(acceleration <= limits.a_max * margin, "{acceleration} m/s²");
+        }
+    }
+}
+
 #[test]
 fn reset_starts_at_the_measured_posture_without_a_jolt() {
     let mut rig = rig(&ControlConfig::default());
@@ -266,4 +315,65 @@ fn arms_that_cannot_are_refused() {
         make(&urdf, Some(Joints::zeros())),
         Err(ControlError::Singular)
     );
+}
+
+/// Three slides of a metre, the last one upright, without any length between them.
+fn gantry() -> ArmModel {
+    let mut urdf = String::from(r#"<robot name="gantry"><link name="l0"/>"#);
+    for (i, axis) in ["1 0 0", "0 1 0", "0 0 1"].iter().enumerate() {
+        urdf += &format!(
+            r#"<link name="l{child}"><inertial><mass value="2"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+            <joint name="j{child}" type="prismatic"><parent link="l{i}"/><child link="l{child}"/><axis xyz="{axis}"/>
+            <limit lower="0" upper="1" velocity="1" effort="200"/></joint>"#,
+            child = i + 1,
+        );
+    }
+    ArmModel::from_urdf(&(urdf + "</robot>"), &LoadOptions::default()).unwrap()
+}
+
+#[test]
+fn a_gantry_of_slides_has_a_workspace_and_moves_in_it() {
+    let arm = Arc::new(gantry());
+    let home = home_posture(&arm);
+    let radius = workspace_radius(&arm, &home);
+    // Down to 2 cm above the floor, in steps of 5 mm.
+    assert!(
+        (0.47..0.485).contains(&radius),
+        "{radius} m around {home:?}"
+    );
+    let mut controller =
+        Controller::new(Arc::clone(&arm), &ControlConfig::default(), &home).unwrap();
+    let mut plant = Plant::new(Arc::clone(&arm), &home).unwrap();
+    let target = Vector3::new(0.7, 0.3, 0.2);
+    let mut tip = Vector3::zeros();
+    for _ in 0..3000 {
+        let demand = Demand::Follow {
+            target,
+            speed_scale: 1.0,
+        };
+        let out = controller.tick(demand, plant.q(), plant.qd());
+        plant.step(&out.tau, DT);
+        tip = out.tip;
+    }
+    assert!((tip - target).norm() < 1e-3, "{tip}");
+}
+
+#[test]
+fn a_slow_arm_is_driven_gently() {
+    // At a hundredth of the built-in arm's joint speeds, full acceleration could not be turned around in time.
+    let mut urdf = default_urdf().to_owned();
+    for speed in ["2.4", "3"] {
+        assert!(urdf.contains(&format!(r#"velocity="{speed}""#)));
+        urdf = urdf.replace(&format!(r#"velocity="{speed}""#), r#"velocity="0.02""#);
+    }
+    let arm = Arc::new(ArmModel::from_urdf(&urdf, &LoadOptions::default()).unwrap());
+    let home = home_posture(&arm);
+    let controller = Controller::new(Arc::clone(&arm), &ControlConfig::default(), &home).unwrap();
+    let CartesianLimits {
+        v_max,
+        a_max,
+        j_max,
+    } = *controller.limits();
+    assert!(v_max < 0.02 && a_max > 1.0, "{v_max} m/s, {a_max} m/s²");
+    assert!(a_max * a_max / j_max + a_max * DT <= 0.81 * v_max);
 }

@@ -8,7 +8,7 @@ use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_sim::arm::{Joints, Plant, PlantReport};
 
 use super::brake::Brake;
-use super::mapping::Mapping;
+use super::mapping::{Mapping, Workspace};
 use crate::control::{Clamps, Controller, Demand};
 use crate::safety::{Safety, SafetyConfig};
 
@@ -171,10 +171,10 @@ pub struct CoreConfig {
     pub safety: SafetyConfig,
     /// Period, s.
     pub tick_s: f64,
-    /// From predicted target to tip, s: 3/ω and the arm's dead time.
+    /// From predicted target to tip, s: the filter's 3/ω, since the simulated arm has no dead time.
     pub lag_s: f64,
-    /// The tip may go this far from where it engaged, m.
-    pub radius_m: f64,
+    /// Where the tip may be.
+    pub workspace: Workspace,
 }
 
 /// The servo's ends of the rings.
@@ -424,9 +424,8 @@ impl Core {
                 (jet.map_or(self.mapping.hand_m, |jet| jet.x), 1.0)
             }
         };
-        let (placed, clamped) = self.mapping.place(hand_m, self.config.radius_m);
-        self.out_of_reach = clamped;
-        self.target_m = self.mapping.tip_m + (placed - self.mapping.tip_m) * eased;
+        (self.target_m, self.out_of_reach) =
+            self.mapping.place(hand_m, &self.config.workspace, eased);
         Demand::Follow {
             target: self.target_m,
             speed_scale: self.safety.speed_scale(now),

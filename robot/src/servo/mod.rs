@@ -14,5 +14,5 @@ pub use self::core::{
     Trajectory, ramp, rings,
 };
 pub use brake::Brake;
-pub use mapping::Mapping;
+pub use mapping::{Mapping, Workspace};
 pub use stats::TickStats;

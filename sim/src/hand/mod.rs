@@ -30,7 +30,8 @@ const PERFORMANCE_STREAM: u64 = 0x9e37_79b9_7f4a_7c15;
 ///
 /// Axes are a Kinect's: x to the side, y up, z away from the sensor. The same `seed` is the same person; `index` counts that person's performances, which
 /// differ in tempo, width, place and every single swing, and drift slowly with the index. Times are those at which the positions hold: a frame's jitter (±1 ms)
-/// is in both. Positions carry 2.5 mm of sensor noise, more while the hand is fast. The same arguments give the same bytes.
+/// is in both. Positions carry 2.5 mm of sensor noise, more while the hand is fast. The same arguments give the same bytes
+/// on one platform: sine and cosine are the standard library's, whose last bits may differ on another.
 ///
 /// Over the persons 0 to 99, the memory-feature prototype trained on the performances 0 to 4 has, on performance 5 and 100 ms ahead,
 /// 0.37 (0.29 to 0.47) of the error of holding the last sample.
