@@ -12,7 +12,7 @@ use super::{
 };
 
 /// The filter's reference may lead the joints' reference by this much, m; beyond, the arm cannot follow and the filter waits for it.
-const LEASH_M: f64 = 0.005;
+const LEASH_M: f64 = 0.002;
 
 /// Bandwidth, limits and gains of a [`Controller`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -305,7 +305,8 @@ impl Controller {
         clamps.at_limit = step.at_limit;
         let lead = step.error_m.norm();
         if lead > LEASH_M {
-            self.filter.shift(step.error_m * (LEASH_M / lead - 1.0));
+            let back = step.error_m * (LEASH_M / lead - 1.0);
+            self.filter.hold_back(back, step.tip_velocity);
             clamps.held_back = true;
         }
 

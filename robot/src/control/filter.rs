@@ -132,9 +132,13 @@ impl LimitedFilter {
         self.state = FilterState::at_rest(p);
     }
 
-    /// Moves the output by `by` metres without touching its velocity: used where the arm cannot follow.
-    pub(super) fn shift(&mut self, by: Vector3<f64>) {
+    /// Moves the output by `by` metres and gives it the velocity `v`: used where the arm cannot follow, so that what comes next starts from what it does.
+    pub(super) fn hold_back(&mut self, by: Vector3<f64>, v: Vector3<f64>) {
         self.state.p += by;
+        self.state.v = limited(v, self.config.v_max).0;
+        if !self.keeps_invariant(&self.state) {
+            self.state.a = Vector3::zeros();
+        }
     }
 
     /// One tick towards `target`, m. `speed_scale` ∈ [0, 1] multiplies the commanded velocity: 0 fades to a stop.

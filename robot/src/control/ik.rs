@@ -54,6 +54,8 @@ pub struct JointStep {
     pub at_limit: u16,
     /// Where the reference is to be, less where it is, m.
     pub error_m: Vector3<f64>,
+    /// Velocity of the reference's tip when the step ends, m/s.
+    pub tip_velocity: Vector3<f64>,
 }
 
 /// Velocity resolution by task priority: position first, orientation in its null space, posture in both.
@@ -240,11 +242,26 @@ impl DifferentialIk {
         let wanted = primary + secondary * largest_share(&primary, &secondary, &lower, &upper);
         let most = self.accelerations * h;
         let change = wanted - qd;
+        // What moves the tip comes first: turning about it must not take the joint acceleration that braking needs.
+        let moved = jacobian.fixed_rows::<3>(0) * qd;
+        let (none, still) = (Joints::zeros(), Vector3::zeros());
+        let asked = tip_velocity * primary_share - moved;
+        let first = resolve(&jacobian, &asked, &still, &none, epsilon).primary;
         let coasting = linear * qd - self.tip_velocity;
         let most_tip = (1.0 + RESERVE) * self.config.a_max * h * (1.0 + 1e-9);
-        let change_share = largest_share(&Joints::zeros(), &change, &-most, &most)
-            .min(share_within(&coasting, &(linear * change), most_tip));
-        let mut next = qd + change * change_share;
+        let change_share = largest_share(&none, &first, &-most, &most).min(share_within(
+            &coasting,
+            &(linear * first),
+            most_tip,
+        ));
+        let first = first * change_share;
+        let rest = change - first;
+        let rest_share = largest_share(&first, &rest, &-most, &most).min(share_within(
+            &(coasting + linear * first),
+            &(linear * rest),
+            most_tip,
+        ));
+        let mut next = qd + first + rest * rest_share;
         for i in 0..self.arm.dof() {
             // Slowing all joints alike for one joint's acceleration must not keep another from braking before its stop.
             next[i] = next[i].clamp(lower[i].max(-f64::MAX), upper[i].min(f64::MAX));
@@ -270,6 +287,7 @@ impl DifferentialIk {
             singular: sigma_min < epsilon,
             at_limit,
             error_m,
+            tip_velocity: self.tip_velocity,
         }
     }
 
