@@ -6,6 +6,7 @@ use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use nalgebra::Vector3;
@@ -15,6 +16,14 @@ use telemime_endpoint::Identity;
 use telemime_operator::demonstration::{Demonstration, Sample};
 
 const PATIENCE: Duration = Duration::from_secs(120);
+
+/// These run in real time: one after the other, so that they do not take each other's.
+static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+
+fn alone() -> MutexGuard<'static, ()> {
+    // A test that failed has nothing left running that matters here.
+    ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner)
+}
 
 /// A process of ours, with what it prints.
 struct Process {
@@ -186,6 +195,7 @@ impl Stage {
 
 #[test]
 fn two_hosts_from_configuration_files() {
+    let _alone = alone();
     let stage = Stage::new();
     let (robot, addr) = stage.robot();
     let operator = stage.operator(&addr, "operator");
@@ -207,6 +217,7 @@ fn two_hosts_from_configuration_files() {
 
 #[test]
 fn a_killed_operator_leaves_a_stopped_arm_and_a_robot_that_serves_the_next() {
+    let _alone = alone();
     let stage = Stage::new();
     let (robot, addr) = stage.robot();
     let operator = stage.operator(&addr, "operator");
@@ -232,6 +243,7 @@ fn a_killed_operator_leaves_a_stopped_arm_and_a_robot_that_serves_the_next() {
 
 #[test]
 fn a_killed_robot_ends_the_operator_with_a_reason() {
+    let _alone = alone();
     let stage = Stage::new();
     let (robot, addr) = stage.robot();
     let operator = stage.operator(&addr, "operator");
@@ -246,6 +258,7 @@ fn a_killed_robot_ends_the_operator_with_a_reason() {
 
 #[test]
 fn a_foreign_key_is_refused_at_both_ends_with_a_remedy() {
+    let _alone = alone();
     let stage = Stage::new();
     let (robot, addr) = stage.robot();
     let stranger = stage.operator(&addr, "stranger");
@@ -258,6 +271,7 @@ fn a_foreign_key_is_refused_at_both_ends_with_a_remedy() {
 
 #[test]
 fn a_taken_port_is_one_clear_line() {
+    let _alone = alone();
     let stage = Stage::new();
     let taken = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
     let addr = taken.local_addr().unwrap().to_string();
@@ -294,6 +308,7 @@ fn mentioning(what: &Path) -> usize {
 
 #[test]
 fn a_killed_demo_leaves_no_orphans() {
+    let _alone = alone();
     let stage = Stage::new();
     let out = stage.path("figures");
     let demo = Process::start(&["demo", "--out", out.to_str().unwrap()]);
@@ -317,6 +332,7 @@ fn a_killed_demo_leaves_no_orphans() {
 
 #[test]
 fn the_demo_gives_one_json_object_and_its_figures() {
+    let _alone = alone();
     let stage = Stage::new();
     let out = stage.path("figures");
     let demo = Process::start(&["demo", "--json", "--out", out.to_str().unwrap()]);
