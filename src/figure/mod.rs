@@ -7,9 +7,7 @@ mod draw;
 mod theme;
 
 use std::path::{Path, PathBuf};
-
-#[allow(unused_imports, reason = "the palette, whole")]
-pub(crate) use theme::{BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION};
+pub(crate) use theme::{BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILLION};
 
 use plotters::style::RGBColor;
 
@@ -62,7 +60,6 @@ pub(crate) enum Shape {
     Dashed(Vec<(f64, f64)>),
     /// The area between two curves over the same abscissa: (x, low, high).
     Band(Vec<(f64, f64, f64)>),
-    #[allow(dead_code, reason = "for paths; the paper's panels are not in metres")]
     /// Everything within a radius of a path, for equal axes.
     Tube(Vec<(f64, f64)>, f64),
     /// A dot at each point.

@@ -6,15 +6,11 @@ use plotters::style::{FontStyle, RGBColor, register_font};
 
 // Okabe and Ito's palette: told apart with every common form of colour blindness.
 pub(crate) const BLACK: RGBColor = RGBColor(32, 32, 36);
-#[allow(dead_code, reason = "the palette, whole")]
 pub(crate) const ORANGE: RGBColor = RGBColor(230, 159, 0);
 pub(crate) const SKY: RGBColor = RGBColor(86, 180, 233);
-#[allow(dead_code, reason = "the palette, whole")]
 pub(crate) const GREEN: RGBColor = RGBColor(0, 158, 115);
 pub(crate) const BLUE: RGBColor = RGBColor(0, 114, 178);
 pub(crate) const VERMILLION: RGBColor = RGBColor(213, 94, 0);
-#[allow(dead_code, reason = "the palette, whole")]
-pub(crate) const PURPLE: RGBColor = RGBColor(204, 121, 167);
 pub(crate) const GREY: RGBColor = RGBColor(128, 128, 134);
 
 pub(super) const INK: RGBColor = RGBColor(40, 40, 46);
