@@ -145,7 +145,7 @@ fn link(args: &LinkArgs) -> anyhow::Result<()> {
                     args.listen
                 )
             })?;
-        println!(
+        say!(
             "relaying {} to {}; Ctrl-C ends it",
             relay.local_addr()?,
             args.to
@@ -175,7 +175,7 @@ fn link(args: &LinkArgs) -> anyhow::Result<()> {
             .await;
         trouble.map_or(Ok(()), |e| Err(anyhow::Error::from(e)))
     });
-    println!("{passed} packets passed, {lost} lost");
+    say!("{passed} packets passed, {lost} lost");
     if let Some(mut out) = record {
         out.flush()?;
     }

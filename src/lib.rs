@@ -1,5 +1,13 @@
 //! The `telemime` command, and the bench on which both daemons run together.
 
+/// As `println!`, but a reader that has gone away (`| head`) is no reason to panic.
+macro_rules! say {
+    ($($arg:tt)*) => {{
+        use std::io::Write as _;
+        let _ = writeln!(std::io::stdout().lock(), $($arg)*);
+    }};
+}
+
 pub mod cli;
 mod demo;
 mod figure;

@@ -63,7 +63,7 @@ pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
         .unwrap_or_else(|| PathBuf::from(format!("{}.skill", skill.name())));
     skill_file::save(&skill, &path)?;
     describe(&skill);
-    println!("saved to {}", path.display());
+    say!("saved to {}", path.display());
     Ok(())
 }
 
@@ -71,17 +71,22 @@ pub(crate) fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
     let skill = skill_file::load(&args.file)?;
     describe(&skill);
     for source in &skill.provenance().sources {
-        println!("  from {source:?}");
+        say!("  from {source:?}");
     }
     let gmr = Gmr::<1, 3>::new(skill.motion())?;
-    println!("inferred motion (t s, x y z m, deviation of each m):");
+    say!("inferred motion (t s, x y z m, deviation of each m):");
     for i in 0..=10 {
         let t_s = skill.duration_s() * f64::from(i) / 10.0;
         let at = gmr.query(&SVector::from([t_s]));
         let deviation = at.covariance.diagonal().map(f64::sqrt);
-        println!(
+        say!(
             "  {t_s:7.3}  {:8.4} {:8.4} {:8.4}   ± {:.4} {:.4} {:.4}",
-            at.mean.x, at.mean.y, at.mean.z, deviation.x, deviation.y, deviation.z
+            at.mean.x,
+            at.mean.y,
+            at.mean.z,
+            deviation.x,
+            deviation.y,
+            deviation.z
         );
     }
     Ok(())
@@ -89,25 +94,27 @@ pub(crate) fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
 
 fn describe(skill: &Skill) {
     let (stats, predictor) = (skill.stats(), skill.predictor());
-    println!(
+    say!(
         "{} ({}), {} bytes",
         skill.name(),
         skill.id(),
         skill.to_bytes().len()
     );
-    println!(
+    say!(
         "  motion: {:.3} s, {} components over (t, x, y, z)",
         skill.duration_s(),
         skill.motion().components().len()
     );
-    println!(
+    say!(
         "  predictor: {} components over the hand's state, {} knots to {:.2} s",
         predictor.components().len(),
         predictor.knots(),
         predictor.knots() as f64 * telemime_protocol::predict::KNOT_SPACING_S
     );
-    println!(
+    say!(
         "  hand: 95 % of speeds below {:.2} m/s, of accelerations below {:.1} m/s²; reach {:.3} m",
-        stats.speed95_m_s, stats.acceleration95_m_s2, stats.reach_m
+        stats.speed95_m_s,
+        stats.acceleration95_m_s2,
+        stats.reach_m
     );
 }

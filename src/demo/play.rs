@@ -11,7 +11,7 @@ use telemime_protocol::spline::{BSpline, End};
 use super::figures::{AXES, load_skill, save, tube_panel};
 use super::judge::{engagement, read_ticks};
 use super::processes::Run;
-use super::summary::{arm, servo};
+use super::summary::{arm, deliver, servo};
 use super::{Args, Material};
 use crate::figure::{BLACK, BLUE, Figure, Layer, ORANGE, Panel, Shape, VERMILLION};
 use crate::measure::Track;
@@ -147,17 +147,7 @@ pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Res
         ],
     };
     let shown = save(args, &figure, "play")?;
-    let mut text = table(&result);
-    for figure in &shown {
-        text.push_str(&format!("figure {}\n", figure.display()));
-    }
-    if args.json {
-        eprint!("{text}");
-        println!("{}", serde_json::to_string(&result)?);
-    } else {
-        print!("{text}");
-    }
-    Ok(())
+    deliver(args, table(&result), &result, &shown)
 }
 
 fn pairs(t: &[f64], x: &[Vector3<f64>], d: usize) -> Vec<(f64, f64)> {

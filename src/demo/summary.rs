@@ -67,15 +67,24 @@ pub(super) fn print(
     figures: &[PathBuf],
 ) -> anyhow::Result<()> {
     let result = gather(args, material, run, verdict)?;
-    let mut text = table(&result);
+    deliver(args, table(&result), &result, figures)
+}
+
+/// The text for people and, with `--json`, the object for machines.
+pub(super) fn deliver(
+    args: &Args,
+    mut text: String,
+    result: &impl Serialize,
+    figures: &[PathBuf],
+) -> anyhow::Result<()> {
     for figure in figures {
         text.push_str(&format!("figure        {}\n", figure.display()));
     }
     if args.json {
         eprint!("{text}");
-        println!("{}", serde_json::to_string(&result)?);
+        say!("{}", serde_json::to_string(result)?);
     } else {
-        print!("{text}");
+        say!("{}", text.trim_end());
     }
     Ok(())
 }

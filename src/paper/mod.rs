@@ -69,9 +69,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     }
     if args.json {
         eprint!("{text}");
-        println!("{}", serde_json::to_string(&report)?);
+        say!("{}", serde_json::to_string(&report)?);
     } else {
-        print!("{text}");
+        say!("{}", text.trim_end());
     }
     Ok(())
 }
