@@ -71,7 +71,11 @@ pub(crate) fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
     let skill = skill_file::load(&args.file)?;
     describe(&skill);
     for source in &skill.provenance().sources {
-        say!("  from {source:?}");
+        let [a, b, c, d, ..] = source.sha256;
+        say!(
+            "  from {} (sha256 {a:02x}{b:02x}{c:02x}{d:02x}…)",
+            source.name
+        );
     }
     let gmr = Gmr::<1, 3>::new(skill.motion())?;
     say!("inferred motion (t s, x y z m, deviation of each m):");
