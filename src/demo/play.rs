@@ -67,18 +67,8 @@ pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Res
     let skill = load_skill(run)?;
     let found = Demonstrations::read_dir(&material.demos, material.matching.as_deref())?;
     let aligned = align(&found.demonstrations)?;
-    let of_demonstrations = |track: &dyn Fn(f64) -> Vector3<f64>| {
-        let estimate: Vec<_> = aligned
-            .times_s
-            .iter()
-            .map(|&t| track(t.clamp(start_s, end_s)))
-            .collect();
-        let each: Vec<_> = aligned
-            .paths
-            .iter()
-            .map(|path| Scores::of(path, &estimate))
-            .collect();
-        Scores::mean(&each)
+    let of_demonstrations = |motion: &dyn Fn(f64) -> Vector3<f64>| {
+        Scores::of_demonstrations(&aligned, |t_s| motion(t_s.clamp(start_s, end_s)))
     };
     let (tick_mean_us, tick_p99_us, _) = servo(run);
     let result = Result {

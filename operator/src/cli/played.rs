@@ -92,17 +92,7 @@ impl Played {
             return None;
         }
         let demonstrations = self.demonstrations.as_ref().map(|aligned| {
-            let estimate: Vec<_> = aligned
-                .times_s
-                .iter()
-                .map(|t_s| self.tip_at(t_s.clamp(start_s, end_s)))
-                .collect();
-            let each: Vec<_> = aligned
-                .paths
-                .iter()
-                .map(|path| Scores::of(path, &estimate))
-                .collect();
-            Scores::mean(&each)
+            Scores::of_demonstrations(aligned, |t_s| self.tip_at(t_s.clamp(start_s, end_s)))
         });
         Some(Event::Played {
             samples: sent.len(),

@@ -10,6 +10,7 @@ use tokio::sync::mpsc;
 
 use super::played::Played;
 use crate::daemon::{Notice, Summary};
+use crate::learn::align::Aligned;
 use crate::session;
 use crate::task::{Outcome, Task};
 
@@ -28,7 +29,7 @@ pub struct Scores {
 
 impl Scores {
     /// The mean of several; the largest distance is the largest of all.
-    pub fn mean(each: &[Self]) -> Self {
+    fn mean(each: &[Self]) -> Self {
         let n = each.len().max(1) as f64;
         Self {
             mae_m: each.iter().map(|s| s.mae_m).sum::<f64>() / n,
@@ -36,6 +37,18 @@ impl Scores {
             r2: each.iter().map(|s| s.r2).sum::<f64>() / n,
             max_m: each.iter().map(|s| s.max_m).fold(0.0, f64::max),
         }
+    }
+
+    /// Of a motion against each demonstration on the common time axis, the mean; `motion` gives the position (m)
+    /// at a time (s).
+    pub fn of_demonstrations(aligned: &Aligned, motion: impl Fn(f64) -> Vector3<f64>) -> Self {
+        let estimate: Vec<_> = aligned.times_s.iter().map(|&t_s| motion(t_s)).collect();
+        let each: Vec<_> = aligned
+            .paths
+            .iter()
+            .map(|path| Self::of(path, &estimate))
+            .collect();
+        Self::mean(&each)
     }
 
     /// Of `estimate` against `truth`, sample by sample; both have the same length.
