@@ -3,6 +3,7 @@
 //! The recordings are public but not ours to ship: without them these tests say that they are skipped.
 
 use std::collections::BTreeMap;
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use nalgebra::{SMatrix, Vector3};
@@ -25,8 +26,11 @@ pub(crate) fn needs(relative: &str) -> Option<PathBuf> {
     if path.exists() {
         return Some(path);
     }
-    eprintln!(
-        "SKIPPED: {} is not there; set TELEMIME_DATA",
+    // Straight to stderr: what a passing test prints by `eprintln!` nobody sees.
+    let name = std::thread::current().name().unwrap_or_default().to_owned();
+    let _ = writeln!(
+        std::io::stderr(),
+        "SKIPPED {name}: {} is not there; set TELEMIME_DATA",
         path.display()
     );
     None
