@@ -10,7 +10,7 @@ use telemime_robot::control::{
 };
 use telemime_sim::arm::{ArmModel, Kinematics, LoadOptions, Notice, Plant};
 
-use crate::prediction::needs;
+use crate::data::needs;
 
 const DT_S: f64 = 1e-3;
 

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::data::needs;
 use nalgebra::Vector3;
 use telemime_protocol::checkpoint::path::{PathDecoder, PathEncoder, TICK_NS};
 use telemime_protocol::checkpoint::select;
@@ -10,16 +11,7 @@ use telemime_protocol::time::Stamp;
 type Recording = (Vec<f64>, Vec<Vector3<f64>>);
 
 fn folder(set: &str) -> Option<PathBuf> {
-    let data = std::env::var_os("TELEMIME_DATA").map_or_else(
-        || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"),
-        PathBuf::from,
-    );
-    let dir = data.join("data/demos").join(set);
-    if dir.is_dir() {
-        return Some(dir);
-    }
-    eprintln!("SKIPPED: no {}; set TELEMIME_DATA", dir.display());
-    None
+    needs(&format!("data/demos/{set}"))
 }
 
 fn recordings(dir: &Path) -> Vec<Recording> {

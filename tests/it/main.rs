@@ -7,6 +7,7 @@
 mod arms;
 mod codec;
 mod commands;
+mod data;
 mod layout;
 mod mirror;
 mod paper;

@@ -1,8 +1,8 @@
 //! `telemime paper` as a user runs it.
 
-use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use crate::data::needs;
 use serde_json::Value;
 
 fn paper(args: &[&str]) -> Output {
@@ -24,23 +24,11 @@ fn r2(block: &Value) -> [f64; 2] {
     serde_json::from_value(block["r2"].clone()).expect("two numbers")
 }
 
-/// The publication's series, or `None` (said aloud) where the shared data are absent.
-fn series() -> Option<PathBuf> {
-    let data = std::env::var_os("TELEMIME_DATA").map_or_else(
-        || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"),
-        PathBuf::from,
-    );
-    let dir = data.join("data/paper");
-    if dir.is_dir() {
-        return Some(dir);
-    }
-    eprintln!("SKIPPED: no {}; set TELEMIME_DATA", dir.display());
-    None
-}
-
 #[test]
 fn its_series_give_its_tables_to_three_decimals() {
-    let Some(dir) = series() else { return };
+    let Some(dir) = needs("data/paper") else {
+        return;
+    };
     let tasks = tasks(&paper(&[
         "--json",
         "--series",

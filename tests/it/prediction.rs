@@ -3,38 +3,14 @@
 //! The recordings are public but not ours to ship: without them these tests say that they are skipped.
 
 use std::collections::BTreeMap;
-use std::io::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use crate::data::{data, needs};
 use nalgebra::{SMatrix, Vector3};
 use telemime_operator::demonstration::Demonstration;
 use telemime_operator::learn::PredictorOptions;
 use telemime_operator::learn::predictor::{states, train, train_from_labels};
 use telemime_protocol::predict::{Forecast, KNOT_SPACING_S, Model, Params};
-
-/// Where the recordings are: `$TELEMIME_DATA`, or `shared` beside the workspace.
-fn data() -> PathBuf {
-    std::env::var_os("TELEMIME_DATA").map_or_else(
-        || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"),
-        PathBuf::from,
-    )
-}
-
-/// The path below [`data`], or a loud note that the test proves nothing without it.
-pub(crate) fn needs(relative: &str) -> Option<PathBuf> {
-    let path = data().join(relative);
-    if path.exists() {
-        return Some(path);
-    }
-    // Straight to stderr: what a passing test prints by `eprintln!` nobody sees.
-    let name = std::thread::current().name().unwrap_or_default().to_owned();
-    let _ = writeln!(
-        std::io::stderr(),
-        "SKIPPED {name}: {} is not there; set TELEMIME_DATA",
-        path.display()
-    );
-    None
-}
 
 fn array<const N: usize>(v: &serde_json::Value) -> [f64; N] {
     let v = v.as_array().unwrap();
