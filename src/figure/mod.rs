@@ -107,6 +107,14 @@ impl Figure {
     /// # Errors
     /// [`FigureError`]; nothing half-drawn is left behind.
     pub(crate) fn write(&self, path: &Path) -> Result<(), FigureError> {
+        if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty())
+            && !folder.is_dir()
+        {
+            return Err(FigureError::Write {
+                path: path.to_owned(),
+                source: std::io::ErrorKind::NotFound.into(),
+            });
+        }
         let ending = path.extension().and_then(|e| e.to_str()).unwrap_or("");
         match ending.to_ascii_lowercase().as_str() {
             "svg" => {
