@@ -112,7 +112,10 @@ impl Figure {
         {
             return Err(FigureError::Write {
                 path: path.to_owned(),
-                source: std::io::ErrorKind::NotFound.into(),
+                source: std::io::Error::new(
+                    std::io::ErrorKind::NotFound,
+                    "its folder does not exist; make it first",
+                ),
             });
         }
         let ending = path.extension().and_then(|e| e.to_str()).unwrap_or("");
