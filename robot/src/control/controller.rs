@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use nalgebra::Vector3;
-use telemime_sim::arm::{ArmModel, Joints};
+use telemime_sim::arm::{ArmModel, Joints, PlantError, check_start};
 
 use super::ik::DifferentialIk;
 use super::{
@@ -64,17 +64,8 @@ pub enum ControlError {
         value: f64,
     },
     /// The start posture is not within the arm's limits.
-    #[error("joint `{joint}` cannot start at {value}: its range is [{lower}, {upper}]")]
-    StartOutside {
-        /// The joint.
-        joint: String,
-        /// Start value, rad or m.
-        value: f64,
-        /// Lower limit.
-        lower: f64,
-        /// Upper limit.
-        upper: f64,
-    },
+    #[error(transparent)]
+    Start(#[from] PlantError),
     /// At the start posture the tip cannot move in every direction.
     #[error(
         "the start posture is singular, or the arm has fewer than three joints that move its tip; choose another posture or --tip"
@@ -197,16 +188,7 @@ impl Controller {
         config: &ControlConfig,
         q0: &Joints,
     ) -> Result<Self, ControlError> {
-        for (joint, &value) in arm.joints().iter().zip(q0.iter()) {
-            if !(value.is_finite() && value >= joint.lower && value <= joint.upper) {
-                return Err(ControlError::StartOutside {
-                    joint: joint.name.clone(),
-                    value,
-                    lower: joint.lower,
-                    upper: joint.upper,
-                });
-            }
-        }
+        check_start(&arm, q0)?;
         for (what, value) in [
             ("joint_bandwidth", config.joint_bandwidth),
             ("orientation_gain", config.orientation_gain),

@@ -310,7 +310,7 @@ fn arms_that_cannot_are_refused() {
     straight[3] = 0.0;
     assert!(matches!(
         make(default_urdf(), Some(straight)),
-        Err(ControlError::StartOutside { .. })
+        Err(ControlError::Start(_))
     ));
     let urdf = default_urdf().replace(r#"upper="-0.1""#, r#"upper="0.1""#);
     assert_eq!(

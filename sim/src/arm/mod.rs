@@ -23,7 +23,7 @@ pub use error::{ArmError, Notice};
 pub use inertia::Body;
 pub use kinematics::Kinematics;
 pub use model::{ArmModel, Joint, JointKind, LoadOptions};
-pub use plant::{Plant, PlantError, PlantReport};
+pub use plant::{Plant, PlantError, PlantReport, check_start};
 
 /// The largest number of moving joints between base and tip.
 pub const MAX_JOINTS: usize = 10;

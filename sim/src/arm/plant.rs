@@ -27,6 +27,24 @@ pub enum PlantError {
     },
 }
 
+/// Whether an arm can start at `q` (rad, m).
+///
+/// # Errors
+/// [`PlantError::StartOutside`] names the first joint whose value is not within its stops, or not finite.
+pub fn check_start(arm: &ArmModel, q: &Joints) -> Result<(), PlantError> {
+    for (joint, &value) in arm.joints().iter().zip(q.iter()) {
+        if !(value.is_finite() && value >= joint.lower && value <= joint.upper) {
+            return Err(PlantError::StartOutside {
+                joint: joint.name.clone(),
+                value,
+                lower: joint.lower,
+                upper: joint.upper,
+            });
+        }
+    }
+    Ok(())
+}
+
 /// What a step ran into: bit `i` stands for joint `i`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct PlantReport {
@@ -57,16 +75,7 @@ impl Plant {
     /// # Errors
     /// [`PlantError::StartOutside`] names the first joint whose value is not within its stops.
     pub fn new(arm: Arc<ArmModel>, q: &Joints) -> Result<Self, PlantError> {
-        for (joint, &value) in arm.joints().iter().zip(q.iter()) {
-            if !(value.is_finite() && value >= joint.lower && value <= joint.upper) {
-                return Err(PlantError::StartOutside {
-                    joint: joint.name.clone(),
-                    value,
-                    lower: joint.lower,
-                    upper: joint.upper,
-                });
-            }
-        }
+        check_start(&arm, q)?;
         let mut start = Joints::zeros();
         start.as_mut_slice()[..arm.dof()].copy_from_slice(&q.as_slice()[..arm.dof()]);
         Ok(Self {
