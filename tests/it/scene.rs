@@ -58,8 +58,10 @@ pub(crate) fn skill() -> Arc<Skill> {
     let learn = || {
         let demonstrations: Vec<_> = (0..5)
             .map(|index| {
-                let sample = |(t_s, position): (f64, Vector3<f64>)| Sample { t_s, position };
-                let samples: Vec<_> = performance(index).into_iter().map(sample).collect();
+                let samples: Vec<_> = performance(index)
+                    .into_iter()
+                    .map(|(t_s, position)| Sample::at(t_s, position))
+                    .collect();
                 Demonstration::from_samples(format!("swing {index}"), &samples).unwrap()
             })
             .collect();
