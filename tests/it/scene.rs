@@ -81,7 +81,10 @@ pub(crate) fn rig() -> Rig {
 /// A replay of `samples` after a moment of rest.
 pub(crate) fn replay(samples: Samples) -> Task {
     Task::replay(Recording {
-        samples,
+        samples: samples
+            .into_iter()
+            .map(|(t_s, x)| Sample::at(t_s, x))
+            .collect(),
         rest_s: REST_S,
     })
 }

@@ -5,6 +5,7 @@ use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use telemime_protocol::predict::{Forecast, Params};
+use telemime_protocol::skill::Gmm;
 
 use super::em::{Convergence, EmOptions, Fit, Start, fit, from_start};
 use super::predictor::states;

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-use super::ahead::{Ahead, CHECK_HORIZONS_S, FOLD_SEED, Motion, fold};
+use super::ahead::{Ahead, Motion};
 use super::{HandState, MEMORY_TAU_S, Model};
 use crate::time::Stamp;
 
@@ -121,13 +121,6 @@ impl Forecast {
     /// The horizon of the last knot, s.
     pub fn reach_s(&self) -> f64 {
         self.ahead.reach_s()
-    }
-
-    /// The predictions at three fixed horizons, rounded to 1 µm and folded (FNV-1a): two ends that
-    /// differ in it have diverged.
-    pub fn checksum(&self) -> u32 {
-        let positions = CHECK_HORIZONS_S.map(|h_s| self.at(h_s).position);
-        fold(FOLD_SEED, positions.iter().flatten())
     }
 }
 

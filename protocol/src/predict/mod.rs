@@ -16,7 +16,7 @@ pub use model::{
     BLOCK, Calibration, Model, ModelError, Posterior, Regression, Standardisation, TARGETS, TEMPER,
 };
 pub use state::{FEATURES, HandState, MEMORY_TAU_S};
-pub use turn::{TurnForecast, TurnModel, TurnPrediction, TurnState};
+pub use turn::{TurnForecast, TurnModel, TurnPrediction, TurnState, checksum};
 
 /// The most knots a forecast may have beyond the present.
 pub const MAX_KNOTS: usize = 24;

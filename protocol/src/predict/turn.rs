@@ -6,7 +6,7 @@
 use nalgebra::{SVector, UnitQuaternion, Vector3};
 
 use super::ahead::{Ahead, CHECK_HORIZONS_S, FOLD_SEED, Motion, fold};
-use super::forecast::motion;
+use super::forecast::{Forecast, motion};
 use super::state::blend;
 use super::{FEATURES, MEMORY_TAU_S, Model, ModelError, Params, Posterior};
 use crate::pose;
@@ -183,12 +183,18 @@ impl TurnForecast {
             beyond: way.beyond,
         }
     }
+}
 
-    /// As [`Forecast::checksum`](super::Forecast::checksum), of the rotation vectors in µrad.
-    pub fn checksum(&self) -> u32 {
-        let ways = CHECK_HORIZONS_S.map(|h_s| self.ahead.at(h_s).displacement);
-        fold(FOLD_SEED, ways.iter().flatten())
-    }
+/// The predictions at three fixed horizons, positions in µm and rotation vectors in µrad, folded (FNV-1a):
+/// two ends that differ in it have diverged.
+pub fn checksum(place: &Forecast, turn: Option<&TurnForecast>) -> u32 {
+    let positions = CHECK_HORIZONS_S.map(|h_s| place.at(h_s).position);
+    let hash = fold(FOLD_SEED, positions.iter().flatten());
+    let Some(turn) = turn else {
+        return hash;
+    };
+    let ways = CHECK_HORIZONS_S.map(|h_s| turn.ahead.at(h_s).displacement);
+    fold(hash, ways.iter().flatten())
 }
 
 #[cfg(test)]
