@@ -96,6 +96,7 @@ fn drive(arm: &Arc<ArmModel>) -> (f64, f64, f64) {
         } else {
             Demand::Follow {
                 target: circle(t + controller.lag_s()),
+                orientation: None,
                 speed_scale: 1.0,
             }
         };

@@ -2,16 +2,20 @@
 
 use std::sync::Arc;
 
-use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Rotation3, SMatrix, SymmetricEigen, UnitQuaternion, Vector3};
 use telemime_sim::arm::{ArmModel, Jacobian, Joints, Kinematics, MAX_JOINTS};
 
 use super::filter::limited;
+use super::turn::{TurnState, rotation_between};
 
 /// How many times a step is resolved again without the joints that are at the end of their range.
 const MAX_DROPPED: usize = 3;
 
 /// What the tip may accelerate by beyond the filter's limit, as a share of it: without it a lag that arises under full acceleration would stay.
 const RESERVE: f64 = 0.04;
+
+/// Below this the freedom to turn about an axis without moving the tip counts as near-singular, rad/rad.
+const TURN_SINGULAR_BELOW: f64 = 0.2;
 
 type Rows = SMatrix<f64, 3, MAX_JOINTS>;
 
@@ -56,6 +60,10 @@ pub struct JointStep {
     pub error_m: Vector3<f64>,
     /// Velocity of the reference's tip when the step ends, m/s.
     pub tip_velocity: Vector3<f64>,
+    /// The rotation that takes the reference's orientation to where it is to be, base axes, rad.
+    pub turn_error_rad: Vector3<f64>,
+    /// Angular velocity of the reference's tip when the step ends, rad/s.
+    pub angular_velocity: Vector3<f64>,
 }
 
 /// Velocity resolution by task priority: position first, orientation in its null space, posture in both.
@@ -76,6 +84,44 @@ pub(super) fn resolve(
     posture_velocity: &Joints,
     epsilon: f64,
 ) -> Resolved {
+    // 0.2 rad/rad: an arm of five axes never has a free rotation about every axis, and what it lacks must not be bought dearly.
+    let calm = |gram: &Matrix3<f64>| damped_inverse(gram, 0.2 * 0.2);
+    resolve_by(
+        jacobian,
+        tip_velocity,
+        angular_velocity,
+        posture_velocity,
+        epsilon,
+        calm,
+    )
+}
+
+/// As [`resolve`], with the orientation followed as exactly as the arm's freedom allows.
+fn resolve_turning(
+    jacobian: &Jacobian,
+    tip_velocity: &Vector3<f64>,
+    angular_velocity: &Vector3<f64>,
+    posture_velocity: &Joints,
+    epsilon: f64,
+) -> Resolved {
+    resolve_by(
+        jacobian,
+        tip_velocity,
+        angular_velocity,
+        posture_velocity,
+        epsilon,
+        selective_inverse,
+    )
+}
+
+fn resolve_by(
+    jacobian: &Jacobian,
+    tip_velocity: &Vector3<f64>,
+    angular_velocity: &Vector3<f64>,
+    posture_velocity: &Joints,
+    epsilon: f64,
+    invert_freed: impl Fn(&Matrix3<f64>) -> Matrix3<f64>,
+) -> Resolved {
     let linear: Rows = jacobian.fixed_rows::<3>(0).into();
     let angular: Rows = jacobian.fixed_rows::<3>(3).into();
     let gram = linear * linear.transpose();
@@ -88,8 +134,7 @@ pub(super) fn resolve(
     let inverse = damped_inverse(&gram, damping);
     let primary = linear.transpose() * (inverse * tip_velocity);
     let freed = angular - (angular * linear.transpose()) * inverse * linear;
-    // 0.2 rad/rad: an arm of five axes never has a free rotation about every axis, and what it lacks must not be bought dearly.
-    let inverse_freed = damped_inverse(&(freed * freed.transpose()), 0.2 * 0.2);
+    let inverse_freed = invert_freed(&(freed * freed.transpose()));
     let left_over = angular_velocity - angular * primary;
     let idle = posture_velocity - linear.transpose() * (inverse * (linear * posture_velocity));
     let secondary = idle + freed.transpose() * (inverse_freed * (left_over - freed * idle));
@@ -104,6 +149,36 @@ fn damped_inverse(gram: &Matrix3<f64>, damping: f64) -> Matrix3<f64> {
     (gram + Matrix3::from_diagonal_element(damping))
         .try_inverse()
         .unwrap_or_else(Matrix3::zeros)
+}
+
+/// The inverse of `gram` axis by axis, damped only about those that the arm can hardly turn about (Maciejewski & Klein 1988): an arm of five axes
+/// lacks one, and follows the others no worse for it.
+fn selective_inverse(gram: &Matrix3<f64>) -> Matrix3<f64> {
+    let Some(eigen) = SymmetricEigen::try_new(*gram, f64::EPSILON, 60) else {
+        return damped_inverse(gram, TURN_SINGULAR_BELOW * TURN_SINGULAR_BELOW);
+    };
+    let most = TURN_SINGULAR_BELOW * TURN_SINGULAR_BELOW;
+    let inverse = eigen.eigenvalues.map(|square| {
+        let square = square.max(0.0);
+        1.0 / (square + 0.25 * (most - square).max(0.0))
+    });
+    eigen.eigenvectors * Matrix3::from_diagonal(&inverse) * eigen.eigenvectors.transpose()
+}
+
+/// The joint speeds (columns) that turn the tip about each base axis at 1 rad/s without moving it, as far as the arm can.
+pub(super) fn turning_rates(jacobian: &Jacobian) -> SMatrix<f64, MAX_JOINTS, 3> {
+    let (zero, none) = (Vector3::zeros(), Joints::zeros());
+    let column = |axis: Vector3<f64>| resolve_turning(jacobian, &zero, &axis, &none, 0.0).secondary;
+    SMatrix::from_columns(&[
+        column(Vector3::x()),
+        column(Vector3::y()),
+        column(Vector3::z()),
+    ])
+}
+
+/// The rotation `axes` (columns: tip axes in base axes) as a quaternion.
+pub(super) fn quaternion(axes: &Matrix3<f64>) -> UnitQuaternion<f64> {
+    UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(*axes))
 }
 
 /// Smallest eigenvalue of a symmetric matrix (Smith 1961).
@@ -196,12 +271,18 @@ impl DifferentialIk {
         &self.reference
     }
 
-    /// One tick: the reference moves so that the tip is at `p` with velocity `v` when the tick ends.
-    /// `secondary` allows the motions that do not move the tip.
+    /// The orientation at the last reset.
+    pub(super) fn orientation(&self) -> UnitQuaternion<f64> {
+        quaternion(&self.orientation)
+    }
+
+    /// One tick: the reference moves so that the tip is at `p` with velocity `v` when the tick ends, and as far as that leaves it free, oriented and
+    /// turning as `turn` says; without it, towards the orientation at the last reset. `secondary` allows the motions that do not move the tip.
     pub(super) fn step(
         &mut self,
         p: &Vector3<f64>,
         v: &Vector3<f64>,
+        turn: Option<&TurnState>,
         secondary: bool,
     ) -> JointStep {
         let h = self.config.dt_s;
@@ -209,15 +290,28 @@ impl DifferentialIk {
         let ahead = q + qd * h;
         self.kinematics.update(&self.arm, &ahead);
         let error_m = p - self.kinematics.tip();
-        let turn = orientation_error(self.kinematics.tip_rotation(), &self.orientation);
+        let at = self.kinematics.tip_rotation();
+        let (turn_error_rad, turning) = match turn {
+            None => (orientation_error(at, &self.orientation), Vector3::zeros()),
+            Some(turn) => (
+                rotation_between(&quaternion(at), &turn.orientation),
+                turn.angular_velocity,
+            ),
+        };
         let mut jacobian = self.kinematics.jacobian();
         let linear: Rows = jacobian.fixed_rows::<3>(0).into();
+        let angular: Rows = jacobian.fixed_rows::<3>(3).into();
         let (tip_velocity, held) = self.tip_command(v, &error_m);
-        let angular_velocity = turn * self.config.orientation_gain;
+        let mut angular_velocity = turn_error_rad * self.config.orientation_gain;
+        let mut by_priority: fn(&_, &_, &_, &_, f64) -> Resolved = resolve;
+        if turn.is_some() {
+            angular_velocity += turning;
+            by_priority = resolve_turning;
+        }
         let idle = (self.rest - ahead) * self.config.posture_gain;
         let epsilon = singular_below(&self.arm);
         let (lower, upper) = self.speed_window(&ahead);
-        let mut resolved = resolve(&jacobian, &tip_velocity, &angular_velocity, &idle, epsilon);
+        let mut resolved = by_priority(&jacobian, &tip_velocity, &angular_velocity, &idle, epsilon);
         let sigma_min = resolved.sigma_min;
         let mut at_limit = 0;
         // A joint at its end does not hold up the others: they take the motion over as far as they can (as in Flacco et al. 2015).
@@ -230,7 +324,7 @@ impl DifferentialIk {
             for i in (0..self.arm.dof()).filter(|i| blocked >> i & 1 == 1) {
                 jacobian.column_mut(i).fill(0.0);
             }
-            resolved = resolve(&jacobian, &tip_velocity, &angular_velocity, &idle, epsilon);
+            resolved = by_priority(&jacobian, &tip_velocity, &angular_velocity, &idle, epsilon);
         }
         let towards = if secondary { 1.0 } else { 0.0 };
         let fade = 10.0 * h;
@@ -288,6 +382,8 @@ impl DifferentialIk {
             at_limit,
             error_m,
             tip_velocity: self.tip_velocity,
+            turn_error_rad,
+            angular_velocity: angular * next,
         }
     }
 

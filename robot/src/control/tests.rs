@@ -44,6 +44,7 @@ impl Rig {
     fn follow(&mut self, target: Vector3<f64>) -> Output {
         self.tick(Demand::Follow {
             target,
+            orientation: None,
             speed_scale: 1.0,
         })
     }
@@ -130,6 +131,7 @@ fn a_demand_far_outside_keeps_every_joint_within_limits() {
             let out = rig.controller.tick(
                 Demand::Follow {
                     target,
+                    orientation: None,
                     speed_scale: 1.0,
                 },
                 &q,
@@ -160,6 +162,7 @@ fn a_demand_far_outside_keeps_every_joint_within_limits() {
         let out = rig.controller.tick(
             Demand::Follow {
                 target: start,
+                orientation: None,
                 speed_scale: 1.0,
             },
             &q,
@@ -351,6 +354,7 @@ fn a_gantry_of_slides_has_a_workspace_and_moves_in_it() {
     for _ in 0..3000 {
         let demand = Demand::Follow {
             target,
+            orientation: None,
             speed_scale: 1.0,
         };
         let out = controller.tick(demand, plant.q(), plant.qd());

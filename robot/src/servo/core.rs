@@ -428,6 +428,7 @@ impl Core {
             self.mapping.place(hand_m, &self.config.workspace, eased);
         Demand::Follow {
             target: self.target_m,
+            orientation: None,
             speed_scale: self.safety.speed_scale(now),
         }
     }
