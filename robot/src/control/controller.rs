@@ -120,7 +120,7 @@ pub enum Demand {
 pub struct Clamps {
     /// The filter was at a limit of speed, acceleration or jerk.
     pub filter: bool,
-    /// The orientation's filter was at a limit of angular speed, acceleration or jerk.
+    /// The orientation's filter was at a limit of angular speed, acceleration or jerk, or the joints' step that turns the tip was slowed to theirs.
     pub turning: bool,
     /// The joints' step was slowed to the speed or acceleration limits of the joints or the tip.
     pub slowed: bool,
@@ -333,6 +333,7 @@ impl Controller {
         let secondary = moving || !self.turn.at_rest();
         let step = self.ik.step(&p, &v, turn.as_ref(), secondary);
         clamps.slowed = step.slowed;
+        clamps.turning |= step.turn_slowed;
         clamps.singular = step.singular;
         clamps.at_limit = step.at_limit;
         let lead = step.error_m.norm();

@@ -52,6 +52,8 @@ pub struct JointReference {
 pub struct JointStep {
     /// The step was slowed along its path to keep the joints or the tip within their limits of speed and acceleration.
     pub slowed: bool,
+    /// The motions that do not move the tip were slowed likewise while an orientation was followed.
+    pub turn_slowed: bool,
     /// The tip is near a singular posture: motion is damped.
     pub singular: bool,
     /// Joints held back by their end of range.
@@ -70,6 +72,8 @@ pub struct JointStep {
 pub(super) struct Resolved {
     pub(super) primary: Joints,
     pub(super) secondary: Joints,
+    /// What of `secondary` is the posture's, the rest being the orientation's.
+    pub(super) idle: Joints,
     /// Smallest singular value of the position Jacobian, m/rad.
     pub(super) sigma_min: f64,
 }
@@ -141,6 +145,7 @@ fn resolve_by(
     Resolved {
         primary,
         secondary,
+        idle: idle - freed.transpose() * (inverse_freed * (freed * idle)),
         sigma_min,
     }
 }
@@ -330,15 +335,20 @@ impl DifferentialIk {
         let fade = 10.0 * h;
         self.secondary_share += (towards - self.secondary_share).clamp(-fade, fade);
 
-        let primary_share = largest_share(&Joints::zeros(), &resolved.primary, &lower, &upper);
+        let none = Joints::zeros();
+        let primary_share = largest_share(&none, &resolved.primary, &lower, &upper);
         let primary = resolved.primary * primary_share;
-        let secondary = resolved.secondary * self.secondary_share;
-        let wanted = primary + secondary * largest_share(&primary, &secondary, &lower, &upper);
+        // An orientation that is followed comes before the posture; one that is merely kept shares with it.
+        let last = turn.map_or(none, |_| resolved.idle * self.secondary_share);
+        let secondary = resolved.secondary * self.secondary_share - last;
+        let secondary_fits = largest_share(&primary, &secondary, &lower, &upper);
+        let mut wanted = primary + secondary * secondary_fits;
+        wanted += last * largest_share(&wanted, &last, &lower, &upper);
         let most = self.accelerations * h;
         let change = wanted - qd;
         // What moves the tip comes first: turning about it must not take the joint acceleration that braking needs.
         let moved = jacobian.fixed_rows::<3>(0) * qd;
-        let (none, still) = (Joints::zeros(), Vector3::zeros());
+        let still = Vector3::zeros();
         let asked = tip_velocity * primary_share - moved;
         let first = resolve(&jacobian, &asked, &still, &none, epsilon).primary;
         let coasting = linear * qd - self.tip_velocity;
@@ -382,6 +392,7 @@ impl DifferentialIk {
             at_limit,
             error_m,
             tip_velocity: self.tip_velocity,
+            turn_slowed: turn.is_some() && (secondary_fits < 1.0 || rest_share < 1.0),
             turn_error_rad,
             angular_velocity: angular * next,
         }
