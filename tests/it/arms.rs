@@ -181,19 +181,25 @@ fn published_arms_hold_and_follow_a_circle() {
 
 #[test]
 fn published_arms_turn_as_they_go() {
-    for (file, turned_at_most) in [
-        ("ur5e/ur5e.urdf", 2e-2),
-        ("example-robot-data/panda.urdf", 2e-2),
-        ("franka_description/fr3.urdf", 2e-2),
-        ("drake_iiwa14/iiwa14_no_collision.urdf", 2e-2),
-        ("kinova_gen3/GEN3-7DOF-NOVISION_FOR_URDF_ARM_V12.urdf", 2e-2),
-        ("xarm/xarm6.urdf", 2e-2),
-        ("xarm/xarm7.urdf", 2e-2),
+    for (file, turn_rad, off_at_most) in [
+        ("ur5e/ur5e.urdf", 0.25, 1e-2),
+        ("example-robot-data/panda.urdf", 0.25, 1e-2),
+        ("franka_description/fr3.urdf", 0.25, 1e-2),
+        ("drake_iiwa14/iiwa14_no_collision.urdf", 0.25, 1e-2),
+        // Its joints are slow, and its wrist bends most of the way.
+        (
+            "kinova_gen3/GEN3-7DOF-NOVISION_FOR_URDF_ARM_V12.urdf",
+            0.12,
+            1e-2,
+        ),
+        ("xarm/xarm6.urdf", 0.25, 1e-2),
+        ("xarm/xarm7.urdf", 0.25, 1e-2),
         // Five axes cannot have both: the place is kept, and the orientation given up as far as it must be.
-        ("so-arm100/so100.urdf", 0.5),
-        ("so-arm100/so101_new_calib.urdf", 0.5),
+        ("so-arm100/so100.urdf", 0.25, 0.6),
+        ("so-arm100/so101_new_calib.urdf", 0.25, 0.6),
     ] {
         let Some(arm) = load(file) else { return };
+        let straight = drive(&arm, None);
         for axis in [Vector3::x(), Vector3::y(), Vector3::z()] {
             let Worst {
                 servo,
@@ -201,10 +207,10 @@ fn published_arms_turn_as_they_go() {
                 turn_servo,
                 turned_off,
                 ..
-            } = drive(&arm, Some(axis * 0.25));
+            } = drive(&arm, Some(axis * turn_rad));
             assert!(servo < 1e-3, "{file}: {servo} m");
-            assert!(off < 4e-3, "{file}: {off} m");
-            assert!(turned_off < turned_at_most, "{file}: {turned_off} rad");
+            assert!(off < 1.1 * straight.off, "{file}: {off} m");
+            assert!(turned_off < off_at_most, "{file}: {turned_off} rad");
             // Wrists with friction are a few mrad behind; where an arm cannot turn, its filter waits.
             let led_at_most = if arm.dof() > 5 { 1e-2 } else { 0.06 };
             assert!(turn_servo < led_at_most, "{file}: {turn_servo} rad");
