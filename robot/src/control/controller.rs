@@ -243,6 +243,8 @@ impl Controller {
             position_gain: 0.1 / config.dt_s,
             v_max: limits.v_max,
             a_max: limits.a_max,
+            turn_v_max: turn_limits.v_max,
+            turn_a_max: turn_limits.a_max,
             orientation_gain: config.orientation_gain,
             posture_gain: config.posture_gain,
             dt_s: config.dt_s,

@@ -28,6 +28,10 @@ pub struct IkConfig {
     pub v_max: f64,
     /// Largest acceleration of the reference's tip, m/s², but for a 25th that is kept to close position errors.
     pub a_max: f64,
+    /// Largest angular speed of the reference's tip while an orientation is followed, rad/s.
+    pub turn_v_max: f64,
+    /// Largest angular acceleration likewise, rad/s², but for a 25th that is kept to close errors.
+    pub turn_a_max: f64,
     /// How fast an orientation error is closed where the arm has joints to spare for it, 1/s.
     pub orientation_gain: f64,
     /// How fast the remaining freedom returns to the rest posture, 1/s.
@@ -226,8 +230,12 @@ pub(super) struct DifferentialIk {
     /// Share of the secondary tasks, faded so that stopping and starting them is no jolt.
     secondary_share: f64,
     reference: JointReference,
+    /// Share of an orientation that is followed: whole at once, since its filter begins at rest, and faded when all stops.
+    turn_share: f64,
     /// Of the reference's tip, m/s.
     tip_velocity: Vector3<f64>,
+    /// The same, rad/s.
+    angular_velocity: Vector3<f64>,
     kinematics: Kinematics,
 }
 
@@ -246,12 +254,14 @@ impl DifferentialIk {
             rest: *q,
             orientation: Matrix3::identity(),
             secondary_share: 0.0,
+            turn_share: 0.0,
             reference: JointReference {
                 q: *q,
                 qd: Joints::zeros(),
                 qdd: Joints::zeros(),
             },
             tip_velocity: Vector3::zeros(),
+            angular_velocity: Vector3::zeros(),
             kinematics: Kinematics::new(),
         };
         ik.reset(q);
@@ -266,7 +276,9 @@ impl DifferentialIk {
             qdd: Joints::zeros(),
         };
         self.secondary_share = 0.0;
+        self.turn_share = 0.0;
         self.tip_velocity = Vector3::zeros();
+        self.angular_velocity = Vector3::zeros();
         self.kinematics.update(&self.arm, q);
         self.orientation = *self.kinematics.tip_rotation();
         self.kinematics.tip()
@@ -296,23 +308,18 @@ impl DifferentialIk {
         self.kinematics.update(&self.arm, &ahead);
         let error_m = p - self.kinematics.tip();
         let at = self.kinematics.tip_rotation();
-        let (turn_error_rad, turning) = match turn {
-            None => (orientation_error(at, &self.orientation), Vector3::zeros()),
-            Some(turn) => (
-                rotation_between(&quaternion(at), &turn.orientation),
-                turn.angular_velocity,
-            ),
+        let turn_error_rad = match turn {
+            None => orientation_error(at, &self.orientation),
+            Some(turn) => rotation_between(&quaternion(at), &turn.orientation),
         };
         let mut jacobian = self.kinematics.jacobian();
         let linear: Rows = jacobian.fixed_rows::<3>(0).into();
         let angular: Rows = jacobian.fixed_rows::<3>(3).into();
         let (tip_velocity, held) = self.tip_command(v, &error_m);
-        let mut angular_velocity = turn_error_rad * self.config.orientation_gain;
-        let mut by_priority: fn(&_, &_, &_, &_, f64) -> Resolved = resolve;
-        if turn.is_some() {
-            angular_velocity += turning;
-            by_priority = resolve_turning;
-        }
+        let (angular_velocity, by_priority): (_, fn(&_, &_, &_, &_, f64) -> Resolved) = match turn {
+            None => (turn_error_rad * self.config.orientation_gain, resolve),
+            Some(turn) => (self.turn_command(turn, &turn_error_rad), resolve_turning),
+        };
         let idle = (self.rest - ahead) * self.config.posture_gain;
         let epsilon = singular_below(&self.arm);
         let (lower, upper) = self.speed_window(&ahead);
@@ -334,13 +341,19 @@ impl DifferentialIk {
         let towards = if secondary { 1.0 } else { 0.0 };
         let fade = 10.0 * h;
         self.secondary_share += (towards - self.secondary_share).clamp(-fade, fade);
+        self.turn_share = (self.turn_share - fade).max(towards);
 
         let none = Joints::zeros();
         let primary_share = largest_share(&none, &resolved.primary, &lower, &upper);
         let primary = resolved.primary * primary_share;
         // An orientation that is followed comes before the posture; one that is merely kept shares with it.
-        let last = turn.map_or(none, |_| resolved.idle * self.secondary_share);
-        let secondary = resolved.secondary * self.secondary_share - last;
+        let (secondary, last) = match turn {
+            None => (resolved.secondary * self.secondary_share, none),
+            Some(_) => (
+                (resolved.secondary - resolved.idle) * self.turn_share,
+                resolved.idle * self.secondary_share,
+            ),
+        };
         let secondary_fits = largest_share(&primary, &secondary, &lower, &upper);
         let mut wanted = primary + secondary * secondary_fits;
         wanted += last * largest_share(&wanted, &last, &lower, &upper);
@@ -360,11 +373,20 @@ impl DifferentialIk {
         ));
         let first = first * change_share;
         let rest = change - first;
-        let rest_share = largest_share(&first, &rest, &-most, &most).min(share_within(
+        let mut rest_share = largest_share(&first, &rest, &-most, &most).min(share_within(
             &(coasting + linear * first),
             &(linear * rest),
             most_tip,
         ));
+        if turn.is_some() {
+            let coasting = angular * (qd + first) - self.angular_velocity;
+            let most_turn = (1.0 + RESERVE) * self.config.turn_a_max * h * (1.0 + 1e-9);
+            // Where the tip's way alone turns it harder, the rest must be free to brake.
+            if coasting.norm() < most_turn {
+                let share = share_within(&coasting, &(angular * rest), most_turn);
+                rest_share = rest_share.min(share);
+            }
+        }
         let mut next = qd + first + rest * rest_share;
         for i in 0..self.arm.dof() {
             // Slowing all joints alike for one joint's acceleration must not keep another from braking before its stop.
@@ -381,6 +403,7 @@ impl DifferentialIk {
             }
         }
         self.tip_velocity = linear * next;
+        self.angular_velocity = angular * next;
         self.reference = JointReference {
             q: q_next,
             qd: next,
@@ -394,7 +417,7 @@ impl DifferentialIk {
             tip_velocity: self.tip_velocity,
             turn_slowed: turn.is_some() && (secondary_fits < 1.0 || rest_share < 1.0),
             turn_error_rad,
-            angular_velocity: angular * next,
+            angular_velocity: self.angular_velocity,
         }
     }
 
@@ -414,6 +437,19 @@ impl DifferentialIk {
         let most = (1.0 + RESERVE) * a_max * dt_s;
         let (change, hard) = limited(wanted - self.tip_velocity, most);
         (self.tip_velocity + change, fast || hard)
+    }
+
+    /// The tip's next angular velocity: the filter's and what closes the orientation error, within the limit of speed.
+    fn turn_command(&self, turn: &TurnState, error_rad: &Vector3<f64>) -> Vector3<f64> {
+        let IkConfig {
+            orientation_gain,
+            turn_v_max,
+            turn_a_max,
+            ..
+        } = self.config;
+        let closing = (2.0 * RESERVE * turn_a_max * error_rad.norm()).sqrt();
+        let (correction, _) = limited(error_rad * orientation_gain, closing);
+        limited(turn.angular_velocity + correction, turn_v_max).0
     }
 
     /// Joints (bits) that `motion` would press against the end of their range.
