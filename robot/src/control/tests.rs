@@ -259,7 +259,13 @@ fn limits_hold_at_the_tip_wherever_the_target_jumps() {
 
 #[test]
 fn limits_of_turning_hold_at_the_tip_wherever_the_target_turns() {
-    for (seed, every, radius) in [(1, 400, 0.0), (2, 250, 0.03), (3, 120, 0.03), (4, 700, 0.0)] {
+    for (seed, every, radius) in [
+        (1, 400, 0.0),
+        (2, 250, 0.03),
+        (3, 120, 0.03),
+        (4, 700, 0.0),
+        (5, 400, 0.15),
+    ] {
         let mut rig = rig(&ControlConfig::default());
         let TurnLimits { v_max, a_max, .. } = *rig.controller.turn_limits();
         let upright = rig.controller.turn_reference().orientation;
@@ -297,11 +303,14 @@ fn limits_of_turning_hold_at_the_tip_wherever_the_target_turns() {
             most[1],
             rig.controller.counts()
         );
-        assert!(off < 1e-2, "{off} m");
-        // A wrist's friction turns around within a tick, and its inertia is small: the arm's own acceleration is not as smooth as its reference.
-        for ((speed, acceleration), slack) in most.into_iter().zip([9.05, 9.6]) {
-            assert!(speed <= v_max * 9.02, "{speed} rad/s");
-            assert!(acceleration <= a_max * slack, "{acceleration} rad/s²");
+        // The tip's way comes first: targets that jump about leave its error as it is without turning (2 mm), and may turn the tip harder than it is asked to.
+        assert!(off < 2.1e-3, "{off} m");
+        if radius == 0.0 {
+            // A wrist's friction turns around within a tick, and its inertia is small: the arm itself is not as smooth as its reference.
+            for ((speed, acceleration), slack) in most.into_iter().zip([1.05, 2.5]) {
+                assert!(speed <= v_max * 1.02, "{speed} rad/s");
+                assert!(acceleration <= a_max * slack, "{acceleration} rad/s²");
+            }
         }
     }
 }

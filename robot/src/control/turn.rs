@@ -13,6 +13,12 @@ use super::{ControlError, FilterConfig, FilterError, FilterState, LimitedFilter}
 /// half a turn must not send it to and fro.
 const EITHER_WAY_RAD: f64 = 0.2;
 
+/// Share of the joints' speed that turning is given: it is needed for the tip's way at the same time.
+const SPEED_SHARE: f64 = 0.8;
+
+/// The same of their acceleration and torque.
+const SHARE: f64 = 0.5;
+
 /// A quaternion whose squared norm is farther than this from 1 is no orientation.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
@@ -42,11 +48,11 @@ impl TurnLimits {
         let mut limits = self;
         for (i, joint) in arm.joints().iter().enumerate() {
             let rate = rates.row(i).norm();
-            limits.v_max = limits.v_max.min(joint.velocity / rate);
+            limits.v_max = limits.v_max.min(SPEED_SHARE * joint.velocity / rate);
             limits.a_max = limits
                 .a_max
-                .min(joint.acceleration.min(ACCELERATION_CAP) / rate)
-                .min(headroom[i] / torques.row(i).norm());
+                .min(SHARE * joint.acceleration.min(ACCELERATION_CAP) / rate)
+                .min(SHARE * headroom[i] / torques.row(i).norm());
         }
         limits.a_max = limits
             .a_max
