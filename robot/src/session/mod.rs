@@ -382,7 +382,13 @@ impl Session {
                     return Err(Refusal::StaleReference);
                 }
                 let forecast = self.forecast(&state, *model, &params.dequantise());
-                (Source::Mirror { forecast, valid_at }, Some(mirror))
+                let source = Source::Mirror {
+                    forecast,
+                    valid_at,
+                    turn: None,
+                    grip: None,
+                };
+                (source, Some(mirror))
             }
             Drive::Play { plan } => {
                 let (_, held) = self
@@ -396,7 +402,12 @@ impl Session {
                     return Err(Refusal::BadPlan);
                 }
                 (
-                    Source::Play(Box::new(Trajectory { spline, duration_s })),
+                    Source::Play(Box::new(Trajectory {
+                        spline,
+                        orientation: None,
+                        grip: None,
+                        duration_s,
+                    })),
                     None,
                 )
             }

@@ -73,6 +73,8 @@ impl Session {
         self.order(Order::Track {
             forecast,
             valid_at,
+            turn: None,
+            grip: None,
             ticket: self.ticket(),
             lease,
         });
