@@ -10,6 +10,7 @@ mod stats;
 #[cfg(test)]
 mod tests;
 mod trial;
+pub mod variational;
 
 use telemime_protocol::predict::ModelError;
 use telemime_protocol::skill::{
@@ -56,6 +57,18 @@ pub enum LearnError {
     OutOfRange {
         /// Its index.
         row: usize,
+    },
+    /// A mixture cannot stand for this many samples.
+    #[error("a mixture of {found} effective samples cannot be refined: a positive number is needed")]
+    EffectiveSamples {
+        /// The number.
+        found: f64,
+    },
+    /// A prior that is no prior.
+    #[error("a prior of {found}: concentration and mean precision are positive numbers")]
+    Prior {
+        /// Its value.
+        found: f64,
     },
     /// The data span no volume, and no ridge was allowed.
     #[error("the data lie in a subspace: no mixture of full covariance fits without a ridge")]
