@@ -1,6 +1,7 @@
 //! From demonstrations to a [`Skill`]: alignment, the motion's mixture, the predictor, both calibrated.
 
 pub mod align;
+pub mod compare;
 pub mod em;
 pub mod kmeans;
 pub mod motion;

@@ -5,7 +5,7 @@
 
 pub(super) mod pass;
 pub(super) mod run;
-mod units;
+pub(super) mod units;
 pub mod update;
 
 use std::fmt;
