@@ -145,7 +145,26 @@ fn skill() -> Skill {
             sha256: [0xab; 32],
         }],
     };
-    Skill::new("wave".to_owned(), &motion, 2.0, &model, stats, provenance).unwrap()
+    Skill::new(Parts {
+        name: "wave".to_owned(),
+        motion,
+        duration_s: 2.0,
+        pace: Pace {
+            mean_ln_s: 0.75,
+            deviation_ln: 0.125,
+        },
+        predictor: model,
+        turn: None,
+        grip: None,
+        task: None,
+        stats,
+        samples: Samples {
+            motion: 60,
+            predictor: 58,
+        },
+        provenance,
+    })
+    .unwrap()
 }
 
 fn info() -> Info {
