@@ -11,7 +11,7 @@ use telemime_endpoint::cli::{self as shell, one_line};
 use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
 
 use crate::relay::{Passage, Relay, RelayConfig};
-use crate::{demo, paper, teach};
+use crate::{demo, paper, select, teach};
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
 /// network delay behind it.
@@ -34,6 +34,8 @@ enum Command {
     Learn(teach::LearnArgs),
     /// Show what a saved skill holds.
     Inspect(teach::InspectArgs),
+    /// Compare mixtures for a folder of demonstrations: kinds, numbers of components, criteria.
+    Select(select::Args),
     /// The operator daemon: teach, drive, play.
     Operator(telemime_operator::cli::Args),
     /// The robot daemon: an arm that follows.
@@ -100,6 +102,7 @@ pub fn main() -> ExitCode {
         Some(Command::Demo(args)) => demo::run(args),
         Some(Command::Learn(args)) => teach::learn(args),
         Some(Command::Inspect(args)) => teach::inspect(args),
+        Some(Command::Select(args)) => select::run(args),
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),
         Some(Command::Link(args)) => link(args),

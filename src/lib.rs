@@ -15,4 +15,5 @@ pub mod ground;
 pub mod measure;
 mod paper;
 pub mod relay;
+mod select;
 mod teach;

@@ -1,6 +1,7 @@
 //! From demonstrations to a [`Skill`]: alignment, the motion's mixture, the predictor, both calibrated.
 
 pub mod align;
+pub mod compare;
 pub mod em;
 pub mod grip;
 pub mod kmeans;
@@ -12,6 +13,7 @@ mod stats;
 mod tests;
 mod trial;
 pub mod turn;
+pub mod variational;
 
 use telemime_protocol::predict::ModelError;
 use telemime_protocol::skill::{
@@ -59,6 +61,20 @@ pub enum LearnError {
     OutOfRange {
         /// Its index.
         row: usize,
+    },
+    /// A mixture cannot stand for this many samples.
+    #[error(
+        "a mixture of {found} effective samples cannot be refined: a positive number is needed"
+    )]
+    EffectiveSamples {
+        /// The number.
+        found: f64,
+    },
+    /// A prior that is no prior.
+    #[error("a prior of {found}: concentration and mean precision are positive numbers")]
+    Prior {
+        /// Its value.
+        found: f64,
     },
     /// The data span no volume, and no ridge was allowed.
     #[error("the data lie in a subspace: no mixture of full covariance fits without a ridge")]
@@ -110,7 +126,7 @@ pub enum Progress {
         components: usize,
         /// Mean log likelihood, nats a sample (s, m).
         score: f64,
-        /// Components that died and were started again or removed.
+        /// Components that died and were started again or removed, and what floors and shrinkage stand for.
         degenerate: Vec<em::Degenerate>,
     },
     /// A predictor was trained without one demonstration and tried on it.
