@@ -355,7 +355,7 @@ mod tests {
         assert_eq!(checked(&q(f64::INFINITY, 0.0)), None);
         assert_eq!(checked(&q(0.0, 0.0)), None);
         assert_eq!(checked(&q(2.0, 0.0)), None);
-        let near = checked(&q(0.7073, 0.7071)).unwrap();
+        let near = checked(&q(0.8002, 0.6)).unwrap();
         assert!((near.as_ref().norm() - 1.0).abs() < 1e-15);
     }
 }
