@@ -9,14 +9,15 @@ use std::collections::BTreeSet;
 use allocation_counter::measure;
 use nalgebra::{UnitQuaternion, Vector1, Vector3, Vector4};
 use telemime_endpoint::Mono;
-use telemime_protocol::predict::{Forecast, HandState, Params};
+use telemime_protocol::checkpoint::PoseCurve;
+use telemime_protocol::predict::{Forecast, HandState, Params, TurnForecast, TurnState};
 use telemime_protocol::skill::example;
 use telemime_protocol::spline::{BSpline, End};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo::{
-    Core, Engagement, Handle, Lease, Order, Report, Source, Ticket, Trajectory, Turn, rings,
+    Core, Engagement, Handle, Lease, Order, Report, Source, Ticket, Trajectory, rings,
 };
 
 const MS: i64 = 1_000_000;
@@ -90,12 +91,14 @@ impl Bench {
     }
 
     /// The hand held turned by `angle` about an axis.
-    fn turn(&self, angle: f64) -> Turn {
-        Turn {
-            valid_at: self.now,
-            orientation: UnitQuaternion::from_scaled_axis(Vector3::new(0.6, 0.0, 0.8) * angle),
-            angular_velocity_rad_s: Vector3::new(0.1, 0.0, -0.2),
-        }
+    fn turn(&self, angle: f64) -> TurnForecast {
+        let q = UnitQuaternion::from_scaled_axis(Vector3::new(0.6, 0.0, 0.8) * angle);
+        let mut state = TurnState::first(Stamp::ZERO, q);
+        state.advance(
+            Stamp::from_secs_f64(0.03),
+            UnitQuaternion::from_scaled_axis(Vector3::new(0.1, 0.0, -0.2)) * q,
+        );
+        TurnForecast::constant_velocity(&state, &Params::DEFAULT)
     }
 
     /// What the hand's newest sample, valid now, predicts.
@@ -129,9 +132,11 @@ fn trajectory(duration_s: f64) -> Source {
         .collect();
     let grip: Vec<_> = t.iter().map(|t| Vector1::new(t / duration_s)).collect();
     Source::Play(Box::new(Trajectory {
-        spline: BSpline::interpolate(&t, &x, End::Natural).unwrap(),
-        orientation: Some(BSpline::interpolate(&t, &q, End::Natural).unwrap()),
-        grip: Some(BSpline::interpolate(&t, &grip, End::Natural).unwrap()),
+        curve: PoseCurve {
+            position: BSpline::interpolate(&t, &x, End::Natural).unwrap(),
+            orientation: Some(BSpline::interpolate(&t, &q, End::Natural).unwrap()),
+            grip: Some(BSpline::interpolate(&t, &grip, End::Natural).unwrap()),
+        },
         duration_s,
     }))
 }

@@ -6,13 +6,17 @@
 
 use nalgebra::{Quaternion, UnitQuaternion, Vector1, Vector3, Vector4};
 use telemime_endpoint::Mono;
-use telemime_protocol::predict::{Forecast, HandState, Params};
+use telemime_protocol::checkpoint::PoseCurve;
+use telemime_protocol::pose;
+use telemime_protocol::predict::{
+    Forecast, HandState, MEMORY_TAU_S, Params, TurnForecast, TurnState,
+};
 use telemime_protocol::spline::{BSpline, End};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo::{
-    Core, Engagement, Handle, Lease, Order, Report, Source, Ticket, Trajectory, Turn, rings,
+    Core, Engagement, Handle, Lease, Order, Report, Source, Ticket, Trajectory, rings,
 };
 
 const MS: i64 = 1_000_000;
@@ -77,7 +81,7 @@ impl Bench {
         self.tick()
     }
 
-    fn mirror(&self, turn: Option<Turn>, grip: Option<f64>) -> Source {
+    fn mirror(&self, turn: Option<TurnForecast>, grip: Option<f64>) -> Source {
         Source::Mirror {
             forecast: still(),
             valid_at: self.now,
@@ -86,7 +90,7 @@ impl Bench {
         }
     }
 
-    fn track(&mut self, turn: Option<Turn>, grip: Option<f64>) {
+    fn track(&mut self, turn: Option<TurnForecast>, grip: Option<f64>) {
         let lease = self.lease();
         self.order(Order::Track {
             ticket: TICKET,
@@ -99,19 +103,15 @@ impl Bench {
     }
 
     /// The hand held as `orientation` from now on.
-    fn held(&self, orientation: UnitQuaternion<f64>) -> Option<Turn> {
-        Some(Turn {
-            valid_at: self.now,
-            orientation,
-            angular_velocity_rad_s: Vector3::zeros(),
-        })
+    fn held(&self, orientation: UnitQuaternion<f64>) -> Option<TurnForecast> {
+        Some(turning(orientation, Vector3::zeros()))
     }
 
     /// `ms` milliseconds of a message every 50 ms, by `message`.
     fn run(
         &mut self,
         ms: i64,
-        mut message: impl FnMut(&Self) -> (Option<Turn>, Option<f64>),
+        mut message: impl FnMut(&Self) -> (Option<TurnForecast>, Option<f64>),
     ) -> Report {
         let mut last = None;
         for i in 0..ms {
@@ -123,6 +123,20 @@ impl Bench {
         }
         last.unwrap()
     }
+}
+
+/// The hand held as `q` and turning at `omega` rad/s in the axes of its position, undamped.
+fn turning(q: UnitQuaternion<f64>, omega: Vector3<f64>) -> TurnForecast {
+    let own = q.inverse() * omega;
+    let state = TurnState {
+        memory: MEMORY_TAU_S.map(|tau_s| pose::moved(&q, &(own * -tau_s))),
+        ..TurnState::first(Stamp::ZERO, q)
+    };
+    let undamped = Params {
+        cv_damping: 1.0,
+        ..Params::DEFAULT
+    };
+    TurnForecast::constant_velocity(&state, &undamped)
 }
 
 fn still() -> Forecast {
@@ -169,15 +183,7 @@ fn a_steady_turn_is_met_without_lag() {
     let engaged_at = bench.now;
     let (axis, speed) = (Vector3::new(0.0, 0.6, 0.8), 0.3);
     let at = |now: Mono| turned(axis, speed * now.secs_since(engaged_at)) * hand();
-    let last = bench.run(1500, |b| {
-        let turn = Turn {
-            valid_at: b.now,
-            orientation: at(b.now),
-            // What is expected of it is half.
-            angular_velocity_rad_s: axis * (2.0 * speed),
-        };
-        (Some(turn), None)
-    });
+    let last = bench.run(1500, |b| (Some(turning(at(b.now), axis * speed)), None));
     // The report is of the tick's beginning, of the arm after the one before.
     let expected = rotation() * axis * (speed * last.at.secs_since(engaged_at));
     let off = (since(&last, &start) - expected).norm();
@@ -251,14 +257,14 @@ fn what_is_no_orientation_is_not_engaged_with_and_stops_what_moves() {
 #[test]
 fn the_grip_follows_at_its_own_speed_and_stays_when_the_motion_ends() {
     let mut bench = Bench::new();
-    let start = bench.engage(bench.mirror(None, Some(0.0)));
+    let start = bench.engage(bench.mirror(None, Some(1.0)));
     assert_eq!(start.opening, 1.0);
-    let closing = bench.run(400, |_| (None, Some(1.0)));
+    let closing = bench.run(400, |_| (None, Some(0.0)));
     assert!((closing.opening - 0.5).abs() < 5e-3, "{}", closing.opening);
     // No news of it: the last one holds.
     let closed = bench.run(600, |_| (None, None));
     assert_eq!(closed.opening, 0.0);
-    let opening = bench.run(200, |_| (None, Some(0.0)));
+    let opening = bench.run(200, |_| (None, Some(1.0)));
     bench.handle.brake.pull(Cause::OperatorStop);
     let mut last = bench.tick();
     assert!((last.opening - opening.opening).abs() < 1e-9);
@@ -287,12 +293,14 @@ fn a_plan_is_played_with_its_orientation_and_grip() {
         // A knot's length does not matter.
         .map(|q| Vector4::new(q.w, q.i, q.j, q.k) * 1.7)
         .collect();
-    let grip: Vec<_> = t.iter().map(|&t| Vector1::new(smooth(t))).collect();
+    let grip: Vec<_> = t.iter().map(|&t| Vector1::new(1.0 - smooth(t))).collect();
     let mut bench = Bench::new();
     let start = bench.engage(Source::Play(Box::new(Trajectory {
-        spline: BSpline::interpolate(&t, &x, End::Natural).unwrap(),
-        orientation: Some(BSpline::interpolate(&t, &q, End::Natural).unwrap()),
-        grip: Some(BSpline::interpolate(&t, &grip, End::Natural).unwrap()),
+        curve: PoseCurve {
+            position: BSpline::interpolate(&t, &x, End::Natural).unwrap(),
+            orientation: Some(BSpline::interpolate(&t, &q, End::Natural).unwrap()),
+            grip: Some(BSpline::interpolate(&t, &grip, End::Natural).unwrap()),
+        },
         duration_s: 2.0,
     })));
     let engaged_at = bench.now;

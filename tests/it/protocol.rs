@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt::{Debug, Display};
 use std::path::Path;
 
-use nalgebra::{SMatrix, SVector, Vector3};
+use nalgebra::{SMatrix, SVector, UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
 use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid, PathKnot};
 use telemime_protocol::checkpoint::{Checkpoint, Grid, Plan, PosePlan};
@@ -389,7 +389,7 @@ fn values() -> BTreeMap<String, String> {
     (0..4).for_each(|i| say(&format!("next m{}", i + 1), vector(&advanced.memory[i])));
 
     let turn = TURN.dequantise(state.t);
-    let turned = |q| vector(&pose::log(q));
+    let turned = |q: &UnitQuaternion<f64>| vector(&pose::log(q));
     say("turn m1", turned(&turn.memory[0]));
     say("turn m4", turned(&turn.memory[3]));
     let turning = TurnForecast::constant_velocity(&turn, &TURN.params.dequantise());
@@ -423,7 +423,10 @@ fn values() -> BTreeMap<String, String> {
         "blend sigma(0.1)",
         format!("{:.9}", forecast.at(0.1).sigma_m),
     );
-    say("blend checksum", format!("{:08x}", checksum(&forecast, None)));
+    say(
+        "blend checksum",
+        format!("{:08x}", checksum(&forecast, None)),
+    );
 
     let mut path = PathDecoder::new(grid(), 8);
     knots::unpack(&STATE, grid(), &motion(None).knots)

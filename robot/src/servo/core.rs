@@ -2,13 +2,12 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
-use telemime_protocol::predict::Forecast;
+use telemime_protocol::predict::{Forecast, TurnForecast};
 use telemime_protocol::wire::v1::Cause;
 use telemime_sim::arm::{Gripper, Plant, PlantReport};
 
 use super::mapping::{Mapping, Workspace};
 use super::orders::{Engagement, Order, Report, Rings, Source, Ticket, Trajectory};
-use super::turn::{Turn, orientation_of, within};
 use crate::control::{Clamps, Controller, Demand};
 use crate::safety::{Safety, SafetyConfig};
 
@@ -55,7 +54,7 @@ enum Drive {
     Mirror {
         forecast: Forecast,
         valid_at: Mono,
-        turn: Option<Turn>,
+        turn: Option<TurnForecast>,
         grip: Option<f64>,
     },
     Play(Box<Trajectory>),
@@ -105,7 +104,7 @@ impl Core {
             rotation: UnitQuaternion::identity(),
             hand_m: Vector3::zeros(),
             tip_m,
-            hand_orientation: UnitQuaternion::identity(),
+            hand_orientation: None,
             tip_orientation: orientation,
         };
         Self {
@@ -237,11 +236,15 @@ impl Core {
         };
         // An orientation that is none would be the reference for all that follows.
         let hand_orientation = match &drive {
-            Drive::Mirror { turn, .. } => turn.map(|turn| turn.is_valid().then(|| turn.at(now))),
+            Drive::Mirror { turn, valid_at, .. } => turn.map(|turn| {
+                let q = turn.at(now.secs_since(*valid_at)).orientation;
+                q.coords.iter().all(|v| v.is_finite()).then_some(q)
+            }),
             Drive::Play(trajectory) => trajectory
+                .curve
                 .orientation
-                .as_ref()
-                .map(|curve| orientation_of(curve, 0.0)),
+                .is_some()
+                .then(|| trajectory.curve.orientation_at(0.0)),
             Drive::Nothing => None,
         };
         if hand_orientation == Some(None)
@@ -256,10 +259,7 @@ impl Core {
             Drive::Mirror {
                 forecast, valid_at, ..
             } => forecast.at(now.secs_since(*valid_at)).position,
-            Drive::Play(trajectory) => trajectory
-                .spline
-                .eval(0.0)
-                .map_or(Vector3::zeros(), |jet| jet.x),
+            Drive::Play(trajectory) => trajectory.curve.position_at(0.0),
             Drive::Nothing => Vector3::zeros(),
         };
         let old = std::mem::replace(&mut self.drive, drive);
@@ -270,7 +270,7 @@ impl Core {
             rotation: engagement.rotation,
             hand_m,
             tip_m,
-            hand_orientation: hand_orientation.flatten().unwrap_or_default(),
+            hand_orientation: hand_orientation.flatten(),
             tip_orientation: self.controller.turn_reference().orientation,
         };
         self.turned_to = None;
@@ -305,11 +305,10 @@ impl Core {
                 turn,
                 grip,
             } => {
-                let due = now.offset_by_secs(self.config.lag_s);
                 let horizon_s = now.secs_since(*valid_at) + self.config.lag_s;
                 (
                     forecast.at(horizon_s).position,
-                    turn.map(|turn| Some(turn.at(due))),
+                    turn.map(|turn| Some(turn.at(horizon_s).orientation)),
                     *grip,
                     ramp(since_s / RAMP_S),
                 )
@@ -320,18 +319,14 @@ impl Core {
                     return Demand::Stop;
                 }
                 let t_s = (since_s + self.config.lag_s).min(trajectory.duration_s);
-                let jet = trajectory.spline.eval(t_s);
+                let curve = &trajectory.curve;
                 (
-                    jet.map_or(self.mapping.hand_m, |jet| jet.x),
-                    trajectory
+                    curve.position_at(t_s),
+                    curve
                         .orientation
-                        .as_ref()
-                        .map(|curve| orientation_of(curve, t_s)),
-                    trajectory
-                        .grip
-                        .as_ref()
-                        .and_then(|curve| within(curve, t_s))
-                        .map(|grip| grip.x),
+                        .is_some()
+                        .then(|| curve.orientation_at(t_s)),
+                    curve.grip_at(t_s),
                     1.0,
                 )
             }
@@ -347,7 +342,7 @@ impl Core {
         }
         if let Some(grip) = grip {
             self.out_of_reach |= !grip.is_finite();
-            self.opening = 1.0 - grip;
+            self.opening = grip;
         }
         Demand::Follow {
             target: self.target_m,

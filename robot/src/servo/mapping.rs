@@ -35,8 +35,8 @@ pub struct Mapping {
     pub hand_m: Vector3<f64>,
     /// The tip at that instant, m in base axes.
     pub tip_m: Vector3<f64>,
-    /// The hand's orientation at that instant; the identity if the hand has none.
-    pub hand_orientation: UnitQuaternion<f64>,
+    /// The hand's orientation at that instant, if it has one.
+    pub hand_orientation: Option<UnitQuaternion<f64>>,
     /// The tip's at that instant: tip axes to base axes.
     pub tip_orientation: UnitQuaternion<f64>,
 }
@@ -57,8 +57,10 @@ impl Mapping {
 
     /// How the tip is to be oriented when the hand is oriented as `hand`, the turn since the engage eased in to the share `eased` ∈ [0, 1].
     pub fn orient(&self, hand: &UnitQuaternion<f64>, eased: f64) -> UnitQuaternion<f64> {
-        let turned =
-            self.rotation * (hand * self.hand_orientation.inverse()) * self.rotation.inverse();
+        let Some(reference) = &self.hand_orientation else {
+            return self.tip_orientation;
+        };
+        let turned = self.rotation * (hand * reference.inverse()) * self.rotation.inverse();
         let turned = if eased < 1.0 {
             UnitQuaternion::from_scaled_axis(turned.scaled_axis() * eased)
         } else {
@@ -84,7 +86,7 @@ mod tests {
             rotation: UnitQuaternion::from_euler_angles(0.3, -1.0, 2.0),
             hand_m: Vector3::new(1.0, 2.0, 3.0),
             tip_m: Vector3::new(0.4, 0.0, 0.5),
-            hand_orientation: UnitQuaternion::identity(),
+            hand_orientation: None,
             tip_orientation: UnitQuaternion::identity(),
         };
         let hand = Vector3::new(0.2, 2.5, 3.1);
@@ -107,11 +109,12 @@ mod tests {
             rotation: UnitQuaternion::from_euler_angles(0.0, 0.0, -core::f64::consts::FRAC_PI_2),
             hand_m: Vector3::zeros(),
             tip_m: Vector3::zeros(),
-            hand_orientation: UnitQuaternion::from_euler_angles(0.4, 0.5, -0.6),
+            hand_orientation: Some(UnitQuaternion::from_euler_angles(0.4, 0.5, -0.6)),
             tip_orientation: UnitQuaternion::from_euler_angles(3.0, 0.1, 0.2),
         };
-        let hand =
-            |turn: Vector3<f64>| UnitQuaternion::from_scaled_axis(turn) * mapping.hand_orientation;
+        let hand = |turn: Vector3<f64>| {
+            UnitQuaternion::from_scaled_axis(turn) * mapping.hand_orientation.unwrap()
+        };
         let seen = |turn: Vector3<f64>, eased: f64| {
             (mapping.orient(&hand(turn), eased) * mapping.tip_orientation.inverse()).scaled_axis()
         };

@@ -9,7 +9,6 @@ mod mapping;
 mod orders;
 mod stats;
 pub mod thread;
-mod turn;
 
 pub use self::core::{Core, CoreConfig, RAMP_S, ramp};
 pub use brake::Brake;
@@ -18,4 +17,3 @@ pub use orders::{
     Engagement, Handle, Lease, Order, Report, Rings, Source, Ticket, Trajectory, rings,
 };
 pub use stats::TickStats;
-pub use turn::Turn;

@@ -2,24 +2,19 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
-use telemime_protocol::predict::Forecast;
-use telemime_protocol::spline::BSpline;
+use telemime_protocol::checkpoint::PoseCurve;
+use telemime_protocol::predict::{Forecast, TurnForecast};
 use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_sim::arm::Joints;
 
 use super::brake::Brake;
 use super::mapping::Mapping;
-use super::turn::Turn;
 
 /// A motion to play: the hand over time in s from 0.
 #[derive(Debug)]
 pub struct Trajectory {
-    /// Position, m.
-    pub spline: BSpline<3>,
-    /// Orientation, hand axes turned from the axes that the position is in: (w, x, y, z), without a change of sign from one knot to the next. It is made unit where it is read.
-    pub orientation: Option<BSpline<4>>,
-    /// Grip: 0 is open, 1 is closed.
-    pub grip: Option<BSpline<1>>,
+    /// Position, and orientation and gripper where the plan has them.
+    pub curve: PoseCurve,
     /// Its end, s.
     pub duration_s: f64,
 }
@@ -37,9 +32,9 @@ pub enum Source {
         forecast: Forecast,
         /// When its newest sample was valid.
         valid_at: Mono,
-        /// The hand's orientation: without one the tip keeps its own for the whole engagement.
-        turn: Option<Turn>,
-        /// The hand's grip: 0 is open, 1 is closed.
+        /// The hand's orientation, valid at the same moment: without one the tip keeps its own for the whole engagement.
+        turn: Option<TurnForecast>,
+        /// How far the gripper is to be open, from 0 to 1.
         grip: Option<f64>,
     },
     /// A plan, from its beginning.
@@ -96,8 +91,8 @@ pub enum Order {
         /// When its newest sample was valid.
         valid_at: Mono,
         /// The hand's orientation; without news of it the last one holds.
-        turn: Option<Turn>,
-        /// The hand's grip; without news of it the last one holds.
+        turn: Option<TurnForecast>,
+        /// How far the gripper is to be open, from 0 to 1; without news of it the last one holds.
         grip: Option<f64>,
         /// For how long.
         lease: Lease,
