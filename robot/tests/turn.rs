@@ -251,14 +251,14 @@ fn what_is_no_orientation_is_not_engaged_with_and_stops_what_moves() {
 #[test]
 fn the_grip_follows_at_its_own_speed_and_stays_when_the_motion_ends() {
     let mut bench = Bench::new();
-    let start = bench.engage(bench.mirror(None, Some(0.0)));
+    let start = bench.engage(bench.mirror(None, Some(1.0)));
     assert_eq!(start.opening, 1.0);
-    let closing = bench.run(400, |_| (None, Some(1.0)));
+    let closing = bench.run(400, |_| (None, Some(0.0)));
     assert!((closing.opening - 0.5).abs() < 5e-3, "{}", closing.opening);
     // No news of it: the last one holds.
     let closed = bench.run(600, |_| (None, None));
     assert_eq!(closed.opening, 0.0);
-    let opening = bench.run(200, |_| (None, Some(0.0)));
+    let opening = bench.run(200, |_| (None, Some(1.0)));
     bench.handle.brake.pull(Cause::OperatorStop);
     let mut last = bench.tick();
     assert!((last.opening - opening.opening).abs() < 1e-9);
@@ -287,7 +287,7 @@ fn a_plan_is_played_with_its_orientation_and_grip() {
         // A knot's length does not matter.
         .map(|q| Vector4::new(q.w, q.i, q.j, q.k) * 1.7)
         .collect();
-    let grip: Vec<_> = t.iter().map(|&t| Vector1::new(smooth(t))).collect();
+    let grip: Vec<_> = t.iter().map(|&t| Vector1::new(1.0 - smooth(t))).collect();
     let mut bench = Bench::new();
     let start = bench.engage(Source::Play(Box::new(Trajectory {
         spline: BSpline::interpolate(&t, &x, End::Natural).unwrap(),

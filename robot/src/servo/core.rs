@@ -347,7 +347,7 @@ impl Core {
         }
         if let Some(grip) = grip {
             self.out_of_reach |= !grip.is_finite();
-            self.opening = 1.0 - grip;
+            self.opening = grip;
         }
         Demand::Follow {
             target: self.target_m,

@@ -18,7 +18,7 @@ pub struct Trajectory {
     pub spline: BSpline<3>,
     /// Orientation, hand axes turned from the axes that the position is in: (w, x, y, z), without a change of sign from one knot to the next. It is made unit where it is read.
     pub orientation: Option<BSpline<4>>,
-    /// Grip: 0 is open, 1 is closed.
+    /// How far the gripper is to be open: 0 is closed, 1 is open.
     pub grip: Option<BSpline<1>>,
     /// Its end, s.
     pub duration_s: f64,
@@ -39,7 +39,7 @@ pub enum Source {
         valid_at: Mono,
         /// The hand's orientation: without one the tip keeps its own for the whole engagement.
         turn: Option<Turn>,
-        /// The hand's grip: 0 is open, 1 is closed.
+        /// How far the gripper is to be open: 0 is closed, 1 is open.
         grip: Option<f64>,
     },
     /// A plan, from its beginning.
@@ -97,7 +97,7 @@ pub enum Order {
         valid_at: Mono,
         /// The hand's orientation; without news of it the last one holds.
         turn: Option<Turn>,
-        /// The hand's grip; without news of it the last one holds.
+        /// How far the gripper is to be open; without news of it the last one holds.
         grip: Option<f64>,
         /// For how long.
         lease: Lease,
