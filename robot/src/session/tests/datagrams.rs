@@ -18,7 +18,7 @@ fn go(bench: &Bench, seq: u32, ms_ago: i64) -> OperatorDatagram {
 fn playing() -> Bench {
     let mut bench = Bench::ready(None);
     let x = [hand(), hand() + Vector3::x(), hand()];
-    let plan = select::bounded(&[0.0, 1.0, 2.0], &x, 0.01).unwrap();
+    let plan: PosePlan = select::bounded(&[0.0, 1.0, 2.0], &x, 0.01).unwrap().into();
     bench.control(&OperatorControl::Plan {
         id: 1,
         bytes: codec::encode(&plan),
