@@ -6,7 +6,7 @@ use super::LearnError;
 use crate::demonstration::Demonstration;
 
 /// Points on the common axis, at most and at least.
-const POINTS: (usize, usize) = (30, 200);
+pub(super) const POINTS: (usize, usize) = (30, 200);
 
 /// How far a warp may stray from proportional time, as a share of the axis.
 const BAND: f64 = 0.25;
@@ -88,6 +88,19 @@ pub fn align(demonstrations: &[Demonstration]) -> Result<Aligned, LearnError> {
     })
 }
 
+/// The moments (s from its own start) of a demonstration that belong to the points of `path`, which are at equal
+/// steps of its time; at least two. Shapes are compared as [`align`] does.
+pub fn warp_to(path: &[Vector3<f64>], d: &Demonstration) -> Vec<f64> {
+    let last = (path.len() - 1) as f64;
+    let mut centred = path.to_vec();
+    centre(&mut centred);
+    Warp::new(&centred, &shape(d, path.len()))
+        .phases()
+        .into_iter()
+        .map(|phase| phase / last * d.duration_s())
+        .collect()
+}
+
 /// A demonstration at `points` equal steps of its own time, about the centre of its bounding box
 /// (which, unlike the mean, does not depend on the pace).
 fn shape(d: &Demonstration, points: usize) -> Vec<Vector3<f64>> {
@@ -96,11 +109,15 @@ fn shape(d: &Demonstration, points: usize) -> Vec<Vector3<f64>> {
     let mut path: Vec<_> = (0..points)
         .map(|i| d.position_at(start_s + i as f64 * step_s))
         .collect();
+    centre(&mut path);
+    path
+}
+
+fn centre(path: &mut [Vector3<f64>]) {
     let low = path.iter().fold(path[0], |a, p| a.inf(p));
     let high = path.iter().fold(path[0], |a, p| a.sup(p));
     let centre = (low + high) * 0.5;
     path.iter_mut().for_each(|p| *p -= centre);
-    path
 }
 
 /// The table of least costs between two paths of the same number of points.

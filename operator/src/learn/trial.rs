@@ -124,6 +124,12 @@ impl<C: Course> Trial<C> {
         }
     }
 
+    /// The share of the states tried whose novelty is above `limit`; 0 of none.
+    pub(super) fn beyond(&self, limit: f64) -> f64 {
+        let beyond = self.novelties.iter().filter(|n| **n > limit).count();
+        beyond as f64 / self.novelties.len().max(1) as f64
+    }
+
     /// `c_h = q₉₀(NEES)/6.251`; trust and damping by least squares.
     pub(super) fn calibration(self) -> Calibration {
         let mut c = Calibration::UNTRIED;

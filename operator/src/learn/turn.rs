@@ -2,7 +2,7 @@
 //! Expectation–maximisation as in Zeestraten et al. 2017, §III: every component lives in the tangent
 //! space at its own mean orientation, found by Gauss–Newton.
 
-use nalgebra::{Matrix3, Matrix4, UnitQuaternion, Vector4};
+use nalgebra::{Matrix3, Matrix4, UnitQuaternion, Vector3, Vector4};
 use telemime_protocol::pose;
 use telemime_protocol::skill::{Gmm, TurnMixture};
 
@@ -108,6 +108,59 @@ fn em(rows: &[Row], k: usize) -> Option<TurnMixture> {
     Some(mixture)
 }
 
+/// Refines a mixture that stands for `n` rows no longer at hand: each component keeps those it had, and shares in
+/// the new ones. What was known of a component is carried to its new mean by parallel transport.
+///
+/// # Errors
+/// [`LearnError::Singular`].
+pub(super) fn update(
+    old: &TurnMixture,
+    n: f64,
+    rows: &[(f64, UnitQuaternion<f64>)],
+) -> Result<TurnMixture, LearnError> {
+    const STEPS: usize = 6;
+    let k = old.charts().len();
+    let mut mixture = old.clone();
+    let mut shares = vec![0.0; rows.len() * k];
+    for _ in 0..STEPS {
+        for ((t_s, q), shares) in rows.iter().zip(shares.chunks_exact_mut(k)) {
+            mixture.responsibilities(*t_s, q, shares);
+        }
+        let mut parts = Vec::with_capacity(k);
+        let mut charts = Vec::with_capacity(k);
+        for (i, (c, before)) in old.gmm().components().iter().zip(old.charts()).enumerate() {
+            let own = || shares.iter().skip(i).step_by(k).copied();
+            let had = c.weight() * n;
+            let total = had + own().sum::<f64>();
+            let new_s = own().zip(rows).map(|(r, row)| r * row.0).sum::<f64>();
+            let t_s = (had * c.mean()[0] + new_s) / total;
+            let new = own().zip(rows.iter().map(|row| row.1));
+            let chart = pose::mean(std::iter::once((had, *before)).chain(new));
+            let chart = chart.ok_or(LearnError::Singular)?;
+            let way = pose::between(before, &chart);
+            let mut carry = Matrix4::identity();
+            let axes = [Vector3::x(), Vector3::y(), Vector3::z()];
+            let turned = Matrix3::from_columns(&axes.map(|v| pose::transported(&v, &way)));
+            carry.fixed_view_mut::<3, 3>(1, 1).copy_from(&turned);
+            let mut scatter = carry * c.covariance() * carry.transpose() * had;
+            let mut add = |t: f64, q: &UnitQuaternion<f64>, r: f64| {
+                let v = pose::between(&chart, q);
+                add_outer(&mut scatter, &Vector4::new(t - t_s, v.x, v.y, v.z), r);
+            };
+            add(c.mean()[0], before, had);
+            own().zip(rows).for_each(|(r, (t, q))| add(*t, q, r));
+            mirror(&mut scatter);
+            parts.push((total, Vector4::new(t_s, 0.0, 0.0, 0.0), scatter / total));
+            charts.push(chart);
+        }
+        let all: f64 = parts.iter().map(|p| p.0).sum();
+        let gmm = Gmm::new(parts.into_iter().map(|(n, m, c)| (n / all, m, c)))
+            .map_err(|_| LearnError::Singular)?;
+        mixture = TurnMixture::new(gmm, charts).map_err(|_| LearnError::Singular)?;
+    }
+    Ok(mixture)
+}
+
 /// What every covariance gets on its diagonal: (s², rad², rad², rad²).
 fn ridge(rows: &[Row]) -> Option<Vector4<f64>> {
     let n = rows.len() as f64;
@@ -170,8 +223,6 @@ fn regression_score(mixture: &TurnMixture, rows: &[Row]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector3;
-
     use super::*;
     use crate::demonstration::Sample;
     use crate::learn::align::align;

@@ -1,0 +1,127 @@
+//! Motions relative to frames: a moved goal is reached, a held-out performance foretold from its own ends.
+
+use nalgebra::{SVector, Vector3};
+use telemime_operator::demonstration::{Demonstration, Demonstrations, Sample};
+use telemime_operator::learn::frames::{GOAL, START, placement};
+use telemime_operator::learn::{LearnOptions, align, frames, motion};
+use telemime_protocol::skill::{Gmm, Gmr, Placement, TaskModel};
+use telemime_sim::hand::reach;
+
+use crate::data::needs;
+
+/// A motion learned both ways.
+struct Learned {
+    plain: Gmm<4>,
+    task: TaskModel,
+    duration_s: f64,
+}
+
+fn learn(demonstrations: &[Demonstration]) -> Learned {
+    let options = LearnOptions {
+        frames: vec![START.to_owned(), GOAL.to_owned()],
+        ..LearnOptions::default()
+    };
+    let aligned = align::align(demonstrations).unwrap();
+    Learned {
+        plain: motion::fit(&aligned, &options, &mut |_| ()).unwrap(),
+        task: frames::fit(&aligned, demonstrations, &options, &mut |_| ()).unwrap(),
+        duration_s: aligned.duration_s,
+    }
+}
+
+impl Learned {
+    fn plain(&self) -> impl Fn(f64) -> Vector3<f64> + '_ {
+        let gmr = Gmr::<1, 3>::new(&self.plain).unwrap();
+        move |t_s| gmr.query(&SVector::from([t_s])).mean
+    }
+
+    fn placed<'a>(&'a self, at: &'a [Placement]) -> impl Fn(f64) -> Vector3<f64> + 'a {
+        move |t_s| self.task.at(t_s, at).unwrap().mean
+    }
+}
+
+/// Root mean square distance of a performance from a motion of `duration_s`, each point at its own share of the
+/// time as dynamic time warping finds it.
+fn rms_m(d: &Demonstration, duration_s: f64, motion: impl Fn(f64) -> Vector3<f64>) -> f64 {
+    let n = 120;
+    let path: Vec<_> = (0..n)
+        .map(|i| motion(duration_s * f64::from(i) / f64::from(n - 1)))
+        .collect();
+    let warp_s = align::warp_to(&path, d);
+    let start_s = d.samples()[0].t_s;
+    let square = |(x, t_s): (&Vector3<f64>, &f64)| (x - d.position_at(start_s + t_s)).norm_squared();
+    (path.iter().zip(&warp_s).map(square).sum::<f64>() / f64::from(n)).sqrt()
+}
+
+fn performance(index: u32, goal: Vector3<f64>) -> Demonstration {
+    let samples: Vec<_> = reach(3, index, goal.into())
+        .into_iter()
+        .map(|(t_s, x)| Sample::at(t_s, Vector3::from(x)))
+        .collect();
+    Demonstration::from_samples(format!("reach {index}"), &samples).unwrap()
+}
+
+/// Goals on a table, at the corners and the middle of a square of ±10 cm.
+fn corner(i: u32) -> Vector3<f64> {
+    let side = |bit: u32| if bit == 0 { -0.1 } else { 0.1 };
+    let away = if i == 4 {
+        Vector3::zeros()
+    } else {
+        Vector3::new(side(i & 1), 0.02 * side(i & 2), side(i & 2))
+    };
+    Vector3::new(0.25, -0.15, 2.05) + away
+}
+
+#[test]
+fn a_moved_goal_is_reached_from_its_own_start() {
+    for count in [1, 5] {
+        let demonstrations: Vec<_> = (0..count).map(|i| performance(i, corner((i + 4) % 5))).collect();
+        let learned = learn(&demonstrations);
+        // Inside the demonstrated square, and 30 % beyond its corners.
+        for (where_, goal) in [
+            ("inside", corner(4) + Vector3::new(0.05, 0.0, -0.04)),
+            ("beyond", corner(4) + (corner(1) - corner(4)) * 1.3),
+            ("beyond", corner(4) + (corner(2) - corner(4)) * 1.3),
+        ] {
+            let truth = performance(50, goal);
+            let at = [START, GOAL].map(|name| placement(&truth, name).unwrap());
+            let (plain, placed) = (learned.plain(), learned.placed(&at));
+            let end = |motion: &dyn Fn(f64) -> Vector3<f64>| {
+                (motion(learned.duration_s) - at[1].origin).norm()
+            };
+            let (missed, reached) = (end(&plain), end(&placed));
+            let begun = (placed(0.0) - at[0].origin).norm();
+            let (without, with) = (
+                rms_m(&truth, learned.duration_s, &plain),
+                rms_m(&truth, learned.duration_s, &placed),
+            );
+            println!(
+                "{count} demonstrations, {where_}: end off by {:.1} mm (plain {:.1}), start by {:.1}; whole motion {:.1} mm RMS (plain {:.1})",
+                reached * 1e3, missed * 1e3, begun * 1e3, with * 1e3, without * 1e3
+            );
+        }
+    }
+}
+
+#[test]
+fn a_held_out_task_is_foretold_from_its_ends() {
+    for (set, floor_m) in [("pouring", 1.0), ("openbox", 1.0)] {
+        let Some(folder) = needs(&format!("data/demos/robottasks/{set}")) else {
+            return;
+        };
+        let all = Demonstrations::read_dir(folder, None).unwrap().demonstrations;
+        let (mut without, mut with) = (0.0, 0.0);
+        for held in 0..all.len() {
+            let mut others = all.clone();
+            let truth = others.remove(held);
+            let learned = learn(&others);
+            let at = [START, GOAL].map(|name| placement(&truth, name).unwrap());
+            let share = 1.0 / all.len() as f64;
+            without += share * rms_m(&truth, learned.duration_s, learned.plain()).powi(2);
+            with += share * rms_m(&truth, learned.duration_s, learned.placed(&at)).powi(2);
+        }
+        let (without, with) = (without.sqrt(), with.sqrt());
+        println!("{set}: {:.1} mm RMS with frames, {:.1} without", with * 1e3, without * 1e3);
+        assert!(with < floor_m);
+    }
+}
