@@ -18,3 +18,4 @@ mod protocol;
 mod safety;
 mod scene;
 mod strangers;
+mod wrist;
