@@ -17,4 +17,5 @@ mod processes;
 mod protocol;
 mod safety;
 mod scene;
+mod selection;
 mod strangers;
