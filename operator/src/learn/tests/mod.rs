@@ -7,6 +7,7 @@ use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use telemime_protocol::predict::{Forecast, Params};
+use telemime_protocol::skill::Gmm;
 
 use super::em::{Convergence, EmOptions, Fit, Start, fit, from_start};
 use super::predictor::states;
@@ -367,14 +368,14 @@ fn swing(name: &str, seed: u64, planar: bool) -> Demonstration {
             } else {
                 0.1 * (2.0 * phase).sin() + noise()
             };
-            Sample {
+            Sample::at(
                 t_s,
-                position: Vector3::new(
+                Vector3::new(
                     size * 0.5 * phase.sin() + noise(),
                     size * 0.3 * (1.0 - phase.cos()) + noise(),
                     z,
                 ),
-            }
+            )
         })
         .collect();
     Demonstration::from_samples(name, &samples).unwrap()
@@ -439,10 +440,7 @@ fn one_demonstration_and_a_planar_one_are_enough() {
 #[test]
 fn a_hand_that_stays_still_is_learned_without_a_fault() {
     let samples: Vec<_> = (0..20)
-        .map(|i| Sample {
-            t_s: f64::from(i) * 0.1,
-            position: Vector3::new(0.1, 0.2, 0.3),
-        })
+        .map(|i| Sample::at(f64::from(i) * 0.1, Vector3::new(0.1, 0.2, 0.3)))
         .collect();
     let demos = [
         Demonstration::from_samples("a", &samples).unwrap(),
