@@ -17,5 +17,6 @@ mod processes;
 mod protocol;
 mod safety;
 mod scene;
+mod selection;
 mod strangers;
 mod wrist;
