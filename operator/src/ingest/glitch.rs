@@ -13,8 +13,8 @@ use super::Pose;
 const LONGEST: usize = 2;
 
 /// Allowed innovation: so many times the neighbours' own, and the recording's median, and this many metres.
-const OF_NEIGHBOURS: f64 = 4.0;
-const OF_MEDIAN: f64 = 8.0;
+const OF_NEIGHBOURS: f64 = 2.5;
+const OF_MEDIAN: f64 = 5.0;
 const LEAST_M: f64 = 0.02;
 
 /// A run is judged only where the samples around it are no further apart than this many usual steps for each step.

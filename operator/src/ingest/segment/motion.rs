@@ -21,7 +21,7 @@ pub(super) struct Motion {
     pub(super) speed: Vec<f64>,
     /// What 98 % of the time is slower, m/s.
     pub(super) fast_m_s: f64,
-    /// What smoothing usually took away from a sample, m: noise, mostly.
+    /// What smoothing took away from most samples at least, m: noise, where the hand is not fast.
     pub(super) noise_m: f64,
 }
 
@@ -69,7 +69,7 @@ impl Motion {
             v,
             speed,
             fast_m_s,
-            noise_m: off[off.len() / 2],
+            noise_m: off[off.len() / 5],
         })
     }
 

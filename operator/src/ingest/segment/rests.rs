@@ -10,16 +10,16 @@ use super::motion::{Motion, steps};
 const SLOW: f64 = 0.12;
 
 /// At rest, noise gives speeds up to so many times the noise, per s.
-const NOISE_PER_S: f64 = 20.0;
+const NOISE_PER_S: f64 = 25.0;
 
 /// Noise never makes more than this share of the fast motion a rest.
-const SLOWEST: f64 = 0.4;
+const SLOWEST: f64 = 0.25;
 
 /// A rest lasts at least this long, s.
 const LEAST_S: f64 = 0.25;
 
 /// For this share of a rest the hand is slower than half the limit; where it only turns, for half of it.
-const STILL: f64 = 0.6;
+const STILL: f64 = 0.7;
 
 /// Rests further apart than this share of the motion's extent are different places.
 const ELSEWHERE: f64 = 0.35;

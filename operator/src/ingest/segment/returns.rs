@@ -10,14 +10,14 @@ use super::motion::{Motion, STEP_S, steps};
 /// Repetitions take at least and at most this long, s.
 const PERIOD_S: (f64, f64) = (0.3, 20.0);
 
-/// Mean squared difference between the motion and itself a period later, as a share of that between unrelated moments.
+/// Mean squared difference between velocities a period apart, as a share of that between unrelated moments.
 const ALIKE: f64 = 0.6;
 
 /// A period is looked for where the motion has become unlike itself first.
 const UNLIKE: f64 = 0.7;
 
 /// Of periods about as good the shortest: a multiple is a period as well.
-const AS_GOOD: f64 = 0.15;
+const AS_GOOD: f64 = 0.3;
 
 /// Squared distance of states at a return, as a share of that between unrelated ones.
 const BACK: f64 = 0.25;
@@ -49,7 +49,7 @@ pub(super) fn find(motion: &Motion, within: Range<usize>) -> Option<Returns> {
     let x = &motion.x[within.clone()];
     let mean = x.iter().sum::<Vector3<f64>>() / x.len().max(1) as f64;
     let variance = x.iter().map(|x| (x - mean).norm_squared()).sum::<f64>() / x.len().max(1) as f64;
-    let period = period(x, variance)?;
+    let period = period(&motion.v[within.clone()])?;
     let rate = 2.0 * PI / (period as f64 * STEP_S);
     let states: Vec<Vector6<f64>> = within
         .clone()
@@ -95,14 +95,16 @@ pub(super) fn find(motion: &Motion, within: Range<usize>) -> Option<Returns> {
     })
 }
 
-/// The time after which the motion is most like itself, in steps.
-fn period(x: &[Vector3<f64>], variance: f64) -> Option<usize> {
-    let longest = (x.len() / 2).min(steps(PERIOD_S.1));
+/// The time after which the motion is most like itself, in steps. Velocities tell: the way up to the first repetition and
+/// down from the last moves the place more than they do, but not for long.
+fn period(v: &[Vector3<f64>]) -> Option<usize> {
+    let longest = (v.len() / 2).min(steps(PERIOD_S.1));
+    let power = v.iter().map(Vector3::norm_squared).sum::<f64>() / v.len().max(1) as f64;
     let unlike: Vec<f64> = (0..=longest)
         .map(|lag| {
-            let pairs = x.iter().zip(&x[lag..]);
-            let n = (x.len() - lag) as f64;
-            pairs.map(|(a, b)| (a - b).norm_squared()).sum::<f64>() / (2.0 * variance * n)
+            let pairs = v.iter().zip(&v[lag..]);
+            let n = (v.len() - lag) as f64;
+            pairs.map(|(a, b)| (a - b).norm_squared()).sum::<f64>() / (2.0 * power * n)
         })
         .collect();
     let after = unlike.iter().position(|d| *d > UNLIKE)?.max(steps(PERIOD_S.0));
