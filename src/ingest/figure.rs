@@ -18,7 +18,10 @@ pub(super) fn figure(recordings: &[(&Path, &Imported)]) -> Figure {
     };
     Figure {
         title: "Demonstrations in raw recordings".into(),
-        note: format!("{takes} demonstrations from {} recordings{beyond}", recordings.len()),
+        note: format!(
+            "{takes} demonstrations from {} recordings{beyond}",
+            recordings.len()
+        ),
         columns: if shown.len() > 3 { 2 } else { 1 },
         panels: shown.iter().map(|(p, i)| panel(p, i)).collect(),
     }
@@ -29,10 +32,10 @@ fn panel(raw: &Path, imported: &Imported) -> Panel {
     let top = 1.05 * speeds.iter().flatten().map(|(_, v)| *v).fold(0.1, f64::max);
     let report = &imported.report;
     let mut layers = Vec::new();
+    // A sliver stays white between neighbours.
+    let sliver_s = 0.002 * report.takes.last().map_or(0.0, |t| t.to_s);
     for (i, take) in report.takes.iter().enumerate() {
-        // A sliver stays white between neighbours.
-        let trim = 0.02 * (take.to_s - take.from_s);
-        let (from, to) = (take.from_s + trim, take.to_s - trim);
+        let (from, to) = (take.from_s + sliver_s, take.to_s - sliver_s);
         let shape = Shape::Band(vec![(from, 0.0, top), (to, 0.0, top)]);
         layers.push(Layer::new(only(i, "demonstration"), SKY, shape));
     }

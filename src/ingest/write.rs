@@ -121,7 +121,12 @@ impl Folder {
         let others = earlier.others.iter().filter(|p| !paths.contains(p));
         if self.shape.is_none() {
             self.shape = others
-                .filter_map(|p| Some((p.clone(), first_line(&fs::read_to_string(p).ok()?).to_owned())))
+                .filter_map(|p| {
+                    Some((
+                        p.clone(),
+                        first_line(&fs::read_to_string(p).ok()?).to_owned(),
+                    ))
+                })
                 .next();
         }
         match &self.shape {
@@ -143,7 +148,8 @@ impl Folder {
             })?;
         }
         let stale = earlier.same_recording.into_iter();
-        self.stale.extend(stale.filter(|p| !paths.contains(p) && !self.written.contains(p)));
+        self.stale
+            .extend(stale.filter(|p| !paths.contains(p) && !self.written.contains(p)));
         self.written.extend(paths.iter().cloned());
         Ok(paths)
     }
@@ -161,7 +167,10 @@ impl Folder {
         let mut earlier = Earlier::default();
         for entry in fs::read_dir(&self.dir).map_err(io)? {
             let path = entry.map_err(io)?.path();
-            if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("csv")) {
+            if path
+                .extension()
+                .is_some_and(|e| e.eq_ignore_ascii_case("csv"))
+            {
                 earlier.others.push(path);
             }
         }

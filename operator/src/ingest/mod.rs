@@ -328,9 +328,7 @@ fn smooth_poses(stretch: &mut [Pose], hz: f64, report: &mut Report) {
         })
         .collect();
     let mut moved_m = report.smoothed.map_or(0.0, |(_, moved)| moved);
-    for (pose, [x, y, z, w, i, j, k, grip]) in
-        stretch.iter_mut().zip(smooth::smooth(&t, &x, hz))
-    {
+    for (pose, [x, y, z, w, i, j, k, grip]) in stretch.iter_mut().zip(smooth::smooth(&t, &x, hz)) {
         let place = Vector3::new(x, y, z);
         moved_m = (place - pose.position).norm().max(moved_m);
         pose.position = place;

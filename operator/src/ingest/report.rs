@@ -107,7 +107,11 @@ impl Report {
             "frame without the hand",
             "frames without the hand",
         );
-        count(self.inferred, "inferred sample kept", "inferred samples kept");
+        count(
+            self.inferred,
+            "inferred sample kept",
+            "inferred samples kept",
+        );
         count(
             self.reordered,
             "sample put in order",

@@ -105,9 +105,7 @@ pub fn repetitions(poses: &[Pose]) -> Found {
                 .collect(),
         };
     }
-    let moving = bouts
-        .first()
-        .map_or(0..motion.len(), |b| b.moving.clone());
+    let moving = bouts.first().map_or(0..motion.len(), |b| b.moving.clone());
     match returns::find(&motion, moving) {
         None => whole(poses),
         Some(found) => Found {

@@ -16,7 +16,7 @@ const NOISE_PER_S: f64 = 25.0;
 const SLOWEST: f64 = 0.25;
 
 /// A rest lasts at least this long, s.
-const LEAST_S: f64 = 0.25;
+const LEAST_S: f64 = 0.3;
 
 /// For this share of a rest the hand is slower than half the limit; where it only turns, for half of it.
 const STILL: f64 = 0.7;
@@ -68,8 +68,7 @@ pub(super) fn bouts(motion: &Motion, rests: &[Range<usize>]) -> Vec<Bout> {
     let extent = (0..3)
         .map(|d| {
             let all = motion.x.iter().map(|x| x[d]);
-            let (low, high) =
-                all.fold((f64::MAX, f64::MIN), |(l, h), x| (l.min(x), h.max(x)));
+            let (low, high) = all.fold((f64::MAX, f64::MIN), |(l, h), x| (l.min(x), h.max(x)));
             (high - low).powi(2)
         })
         .sum::<f64>()

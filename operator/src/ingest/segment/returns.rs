@@ -11,10 +11,10 @@ use super::motion::{Motion, STEP_S, steps};
 const PERIOD_S: (f64, f64) = (0.3, 20.0);
 
 /// Mean squared difference between velocities a period apart, as a share of that between unrelated moments.
-const ALIKE: f64 = 0.6;
+const ALIKE: f64 = 0.7;
 
 /// A period is looked for where the motion has become unlike itself first.
-const UNLIKE: f64 = 0.7;
+const UNLIKE: f64 = 0.8;
 
 /// Of periods about as good the shortest: a multiple is a period as well.
 const AS_GOOD: f64 = 0.3;
@@ -32,6 +32,9 @@ const REPETITION: (f64, f64) = (0.5, 1.6);
 /// the motion's variance.
 const SAME_TIME: (f64, f64) = (0.7, 1.4);
 const SAME_WAY: f64 = 0.25;
+
+/// Repetitions go along their mean to this share of their variance, or they are none.
+const REPEATS: f64 = 0.3;
 
 /// At most so many states are tried as the one to return to.
 const ANCHORS: usize = 150;
@@ -84,8 +87,23 @@ pub(super) fn find(motion: &Motion, within: Range<usize>) -> Option<Returns> {
     if tail_in {
         pieces.push(tail);
     }
+    let n = pieces.len();
+    if n < 2 {
+        return None;
+    }
+    // Each piece draws the mean towards itself by one nth.
+    let apart = pieces.iter().map(|p| off_mean(x, p, &pieces)).sum::<f64>() / (n - 1) as f64;
+    let repeated = &x[pieces[0].start..pieces[n - 1].end];
+    let centre = repeated.iter().sum::<Vector3<f64>>() / repeated.len() as f64;
+    let spread = repeated
+        .iter()
+        .map(|x| (x - centre).norm_squared())
+        .sum::<f64>();
+    if apart > REPEATS * spread / repeated.len() as f64 {
+        return None;
+    }
     let shift = within.start;
-    (pieces.len() > 1).then(|| Returns {
+    Some(Returns {
         marks: marks.iter().map(|m| m + shift).collect(),
         pieces: pieces
             .into_iter()
@@ -107,7 +125,10 @@ fn period(v: &[Vector3<f64>]) -> Option<usize> {
             pairs.map(|(a, b)| (a - b).norm_squared()).sum::<f64>() / (2.0 * power * n)
         })
         .collect();
-    let after = unlike.iter().position(|d| *d > UNLIKE)?.max(steps(PERIOD_S.0));
+    let after = unlike
+        .iter()
+        .position(|d| *d > UNLIKE)?
+        .max(steps(PERIOD_S.0));
     let lows: Vec<usize> = (after + 1..longest)
         .filter(|&i| unlike[i] <= unlike[i - 1] && unlike[i] <= unlike[i + 1])
         .collect();
