@@ -19,12 +19,18 @@ pub(super) fn figure(recordings: &[(&Path, &Imported)]) -> Figure {
     Figure {
         title: "Demonstrations in raw recordings".into(),
         note: format!(
-            "{takes} demonstrations from {} recordings{beyond}",
-            recordings.len()
+            "{takes} demonstration{} from {} recording{}{beyond}",
+            plural(takes),
+            recordings.len(),
+            plural(recordings.len())
         ),
         columns: if shown.len() > 3 { 2 } else { 1 },
         panels: shown.iter().map(|(p, i)| panel(p, i)).collect(),
     }
+}
+
+fn plural(n: usize) -> &'static str {
+    if n == 1 { "" } else { "s" }
 }
 
 fn panel(raw: &Path, imported: &Imported) -> Panel {

@@ -57,6 +57,9 @@ pub(crate) struct Args {
     /// Which source axis, signed, our x, y and z each are, as x,-z,y [default: x,y,z].
     #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
     axes: Option<Axes>,
+    /// Readings of the gripper when it is closed and when it is open.
+    #[arg(long, value_name = "CLOSED,OPEN", default_value = "0,1", value_parser = range, allow_hyphen_values = true)]
+    grip_range: (f64, f64),
     /// Smooth without shifting in time, −3 dB at this frequency [default: no smoothing].
     #[arg(long, value_name = "HZ", value_parser = positive)]
     smooth: Option<f64>,
@@ -90,6 +93,14 @@ fn positive(text: &str) -> Result<f64, String> {
         .ok_or_else(|| format!("{text:?} is not a number above 0"))
 }
 
+fn range(text: &str) -> Result<(f64, f64), String> {
+    let number = |t: &str| t.trim().parse().ok().filter(|v: &f64| v.is_finite());
+    text.split_once(',')
+        .and_then(|(closed, open)| number(closed).zip(number(open)))
+        .filter(|(closed, open)| closed != open)
+        .ok_or_else(|| format!("{text:?} is not two different numbers, as 0,0.08"))
+}
+
 fn folder_name(text: &str) -> Result<String, String> {
     let plain = !text.contains(['/', '\\']) && !text.starts_with('.');
     if plain && (1..=64).contains(&text.len()) {
@@ -118,6 +129,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         time: args.time_unit,
         length: args.unit,
         axes: args.axes.unwrap_or_default(),
+        grip_range: args.grip_range,
         max_gap_s: args.max_gap,
         keep_glitches: args.keep_glitches,
         smooth_hz: args.smooth,

@@ -169,6 +169,20 @@ pub enum Fault {
         /// Its length.
         norm: f64,
     },
+    /// A gripper's opening outside its range.
+    #[error(
+        "line {line}: grip is {value}, outside the range from {closed} (closed) to {open} (open); state it (--grip-range)"
+    )]
+    Grip {
+        /// The line, from 1.
+        line: u64,
+        /// The value, in the file's unit.
+        value: f64,
+        /// What closed is in that unit.
+        closed: f64,
+        /// What open is.
+        open: f64,
+    },
     /// A cut by hand outside the recording.
     #[error("no samples around the cut at {t_s} s; the recording has {parts}")]
     CutOutside {

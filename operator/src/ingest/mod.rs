@@ -54,7 +54,7 @@ pub struct Pose {
     pub position: Vector3<f64>,
     /// Unit quaternion w, x, y, z.
     pub orientation: Option<[f64; 4]>,
-    /// The gripper, in the recording's unit.
+    /// How far the gripper is open, from 0 to 1.
     pub grip: Option<f64>,
 }
 
@@ -87,6 +87,8 @@ pub struct Options {
     pub length: Option<LengthUnit>,
     /// The source's axes.
     pub axes: Axes,
+    /// The gripper's readings when closed and when open.
+    pub grip_range: (f64, f64),
     /// A hole longer than this splits, s.
     pub max_gap_s: f64,
     /// Whether glitches stay.
@@ -107,6 +109,7 @@ impl Default for Options {
             time: None,
             length: None,
             axes: Axes::default(),
+            grip_range: (0.0, 1.0),
             max_gap_s: MAX_GAP_S,
             keep_glitches: false,
             smooth_hz: None,
@@ -180,6 +183,7 @@ pub fn import(bytes: &[u8], options: &Options) -> Result<Imported, Fault> {
         seconds,
         metres: report.length_unit.metres(),
         axes: options.axes,
+        grip_range: options.grip_range,
         max_gap_s: options.max_gap_s,
     };
     let poses = order::ordered(&raws.samples, &scale, &mut report)?;
@@ -334,7 +338,7 @@ fn smooth_poses(stretch: &mut [Pose], hz: f64, report: &mut Report) {
         pose.position = place;
         let norm = (w * w + i * i + j * j + k * k).sqrt();
         pose.orientation = pose.orientation.map(|_| [w, i, j, k].map(|c| c / norm));
-        pose.grip = pose.grip.map(|_| grip);
+        pose.grip = pose.grip.map(|_| grip.clamp(0.0, 1.0));
     }
     report.smoothed = Some((hz, moved_m));
 }

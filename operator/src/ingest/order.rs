@@ -16,6 +16,7 @@ pub(super) struct Scale {
     pub(super) seconds: f64,
     pub(super) metres: f64,
     pub(super) axes: Axes,
+    pub(super) grip_range: (f64, f64),
     pub(super) max_gap_s: f64,
 }
 
@@ -59,11 +60,23 @@ pub(super) fn ordered(raw: &[Raw], scale: &Scale, report: &mut Report) -> Result
                 Some(scale.axes.orientation(q.map(|c| c / norm)))
             }
         };
+        let (closed, open) = scale.grip_range;
+        let grip = sample.grip.map(|g| (g - closed) / (open - closed));
+        if let (Some(grip), Some(value)) = (grip, sample.grip)
+            && !(0.0..=1.0).contains(&grip)
+        {
+            return Err(Fault::Grip {
+                line: sample.line,
+                value,
+                closed,
+                open,
+            });
+        }
         poses.push(Pose {
             t_s,
             position: scale.axes.position(position * scale.metres),
             orientation,
-            grip: sample.grip,
+            grip,
         });
     }
     poses.sort_by(|a, b| a.t_s.total_cmp(&b.t_s));

@@ -102,13 +102,20 @@ fn rows(bytes: &[u8]) -> Result<(Vec<Row>, bool), Fault> {
         .comment(Some(b'#'))
         .delimiter(delimiter)
         .from_reader(text.as_bytes());
+    // The reader counts remarks and blank lines to the record after them; a line a record, they are known.
+    let lines: Vec<u64> = (1..)
+        .zip(text.lines())
+        .filter(|(_, l)| !l.is_empty() && !l.starts_with('#'))
+        .map(|(n, _)| n)
+        .collect();
     let mut rows = Vec::new();
-    for record in reader.records() {
+    for (nth, record) in reader.records().enumerate() {
         let fields = record.map_err(|e| Fault::Csv {
             line: e.position().map_or(1, csv::Position::line),
             why: e.to_string(),
         })?;
-        let line = fields.position().map_or(0, csv::Position::line);
+        let counted = || fields.position().map_or(0, csv::Position::line);
+        let line = lines.get(nth).copied().unwrap_or_else(counted);
         if fields.iter().any(|f| !f.is_empty()) {
             rows.push(Row { line, fields });
         }

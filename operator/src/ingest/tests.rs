@@ -207,6 +207,19 @@ fn poses_come_along_with_unit_length_and_a_steady_sign() {
     );
     let read = crate::demonstration::Demonstration::parse("pose.csv", csv.as_bytes()).unwrap();
     assert_eq!(read.samples().len(), 30);
+
+    let shut = Options {
+        grip_range: (0.5, 0.0),
+        ..options.clone()
+    };
+    let half = with(&text, &shut).unwrap();
+    assert_eq!(half.takes[0].samples[3].grip, Some(0.5));
+    let narrow = Options {
+        grip_range: (0.0, 0.2),
+        ..options
+    };
+    let fault = with(&text, &narrow).unwrap_err();
+    assert!(matches!(fault, Fault::Grip { line: 3, .. }), "{fault}");
 }
 
 #[test]
