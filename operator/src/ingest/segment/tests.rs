@@ -95,9 +95,10 @@ fn a_hand_that_does_one_thing_or_nothing_is_left_alone() {
         let found = repetitions(&once);
         assert_eq!(
             (found.method, found.ranges.as_slice()),
-            (Method::Whole, &[0..90][..])
+            (Method::Whole, std::slice::from_ref(&(0..90)))
         );
     }
     assert!(repetitions(&[]).ranges.is_empty());
-    assert_eq!(repetitions(&poses(1, reach_and_back)).ranges, [0..1]);
+    let one = repetitions(&poses(1, reach_and_back));
+    assert_eq!((one.ranges.len(), one.ranges[0].clone()), (1, 0..1));
 }
