@@ -202,15 +202,16 @@ fn waving_without_rest_is_cut_where_it_turns() {
             };
             let half = noise_m * 3.0_f64.sqrt();
             let rows = wave.into_iter().enumerate().filter_map(|(i, (t, x))| {
-                kept(i, &mut rng).then(|| {
-                    let late = if i == 0 {
-                        0.0
-                    } else {
-                        rng.random_range(-0.01..0.01)
-                    };
-                    let x = x.map(|x| x + half * rng.random_range(-1.0..1.0));
-                    (t + late, x)
-                })
+                if !kept(i, &mut rng) {
+                    return None;
+                }
+                let late = if i == 0 {
+                    0.0
+                } else {
+                    rng.random_range(-0.01..0.01)
+                };
+                let x = x.map(|x| x + half * rng.random_range(-1.0..1.0));
+                Some((t + late, x))
             });
             rows.collect()
         });
