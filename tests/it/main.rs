@@ -8,6 +8,7 @@ mod arms;
 mod codec;
 mod commands;
 mod data;
+mod ingest;
 mod layout;
 mod mirror;
 mod paper;

@@ -134,6 +134,18 @@ fn frames(seed: u64, index: u32) -> (Vec<(f64, [f64; 3])>, Vec<f64>) {
     }
 }
 
+/// When the hand of [`swing`] turns, s: from the end of raising it on, every time it changes sides. Two turns are one swing to and fro.
+///
+/// ```
+/// let turns = telemime_sim::hand::turns(7, 0);
+/// assert!(turns.len() > 12 && turns.is_sorted());
+/// ```
+pub fn turns(seed: u64, index: u32) -> Vec<f64> {
+    let mut rng = stream(seed, u64::from(index) + 1);
+    let path = Performance::new(&Person::new(seed), index, &mut rng).turns;
+    path.iter().map(|turn| turn.t_s).collect()
+}
+
 fn stream(seed: u64, n: u64) -> Xoshiro256PlusPlus {
     Xoshiro256PlusPlus::seed_from_u64(seed ^ n.wrapping_mul(PERFORMANCE_STREAM))
 }
