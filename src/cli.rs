@@ -31,7 +31,7 @@ enum Command {
     /// Both daemons as two processes over a shaped link, and what became of the delay.
     Demo(demo::Args),
     /// Make demonstrations of raw recordings: skeletons, or tables of a hand's path.
-    Import(ingest::Args),
+    Import(Box<ingest::Args>),
     /// Learn a skill from a folder of demonstrations and save it.
     Learn(teach::LearnArgs),
     /// Show what a saved skill holds.

@@ -105,7 +105,6 @@ fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
 }
 
 /// A performance as the sensor sees it, and the forearm's true lean from upright (rad) in every frame.
-#[expect(clippy::type_complexity, reason = "two lists of one length")]
 fn frames(seed: u64, index: u32) -> (Vec<(f64, [f64; 3])>, Vec<f64>) {
     let person = Person::new(seed);
     let mut rng = stream(seed, u64::from(index) + 1);
