@@ -11,7 +11,7 @@ use telemime_endpoint::cli::{self as shell, one_line};
 use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
 
 use crate::relay::{Passage, Relay, RelayConfig};
-use crate::{demo, paper, select, teach};
+use crate::{demo, ingest, paper, select, teach};
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
 /// network delay behind it.
@@ -30,6 +30,8 @@ struct Cli {
 enum Command {
     /// Both daemons as two processes over a shaped link, and what became of the delay.
     Demo(demo::Args),
+    /// Make demonstrations of raw recordings: skeletons, or tables of a hand's path.
+    Import(Box<ingest::Args>),
     /// Learn a skill from a folder of demonstrations and save it.
     Learn(teach::LearnArgs),
     /// Show what a saved skill holds.
@@ -37,7 +39,7 @@ enum Command {
     /// Compare mixtures for a folder of demonstrations: kinds, numbers of components, criteria.
     Select(select::Args),
     /// The operator daemon: teach, drive, play.
-    Operator(telemime_operator::cli::Args),
+    Operator(Box<telemime_operator::cli::Args>),
     /// The robot daemon: an arm that follows.
     Robot(telemime_robot::cli::Args),
     /// A UDP relay that delays, loses and throttles what passes.
@@ -100,6 +102,7 @@ pub fn main() -> ExitCode {
     let done = match &cli.command {
         None => demo::run(&cli.demo),
         Some(Command::Demo(args)) => demo::run(args),
+        Some(Command::Import(args)) => ingest::run(args),
         Some(Command::Learn(args)) => teach::learn(args),
         Some(Command::Inspect(args)) => teach::inspect(args),
         Some(Command::Select(args)) => select::run(args),

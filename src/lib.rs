@@ -12,6 +12,7 @@ pub mod cli;
 mod demo;
 mod figure;
 pub mod ground;
+mod ingest;
 pub mod measure;
 mod paper;
 pub mod relay;

@@ -290,6 +290,19 @@ fn text(name: &str, table: &Table, all: bool) -> String {
         out.push_str(" To truth: of the one by held out.");
     }
     out.push('\n');
+    let last = table.rows.iter().map(|row| row.components).max();
+    let at_end = |criterion: &Criterion| {
+        let best = table.best(*criterion, None);
+        best.is_some_and(|row| Some(row.components) == last)
+    };
+    if let Some(last) = last.filter(|last| *last < MAX_COMPONENTS)
+        && Criterion::ALL.iter().any(at_end)
+    {
+        out.push_str(&format!(
+            "{last} is the last number tried and the best by some column: more may be better, try --components 1..{}.\n",
+            (2 * last).min(MAX_COMPONENTS)
+        ));
+    }
     let degenerate = table.rows.iter().filter(|row| !row.degenerate.is_empty());
     let degenerate = degenerate.count();
     if degenerate > 0 {

@@ -4,6 +4,7 @@
 pub mod cli;
 pub mod daemon;
 pub mod demonstration;
+pub mod ingest;
 pub mod learn;
 pub mod session;
 pub mod skill_file;

@@ -131,6 +131,8 @@ pub enum Event {
         rotation: [f64; 4],
         hand_m: [f64; 3],
         tip_m: [f64; 3],
+        hand_q: Option<[f64; 4]>,
+        tip_q: [f64; 4],
     },
     Path {
         knots: Vec<(f64, [f64; 3], [f64; 3], bool)>,
@@ -370,14 +372,16 @@ async fn listen_to(
 }
 
 fn engaged(report: &Report) -> Event {
-    let q = report.mapping.rotation.as_ref();
+    let scalar_first = |q: &nalgebra::UnitQuaternion<f64>| [q.w, q.i, q.j, q.k];
     Event::Engaged {
         engagement: report.engagement.number,
         mono_ns: report.engaged_at.0,
         scale: report.mapping.scale,
-        rotation: [q.w, q.i, q.j, q.k],
+        rotation: scalar_first(&report.mapping.rotation),
         hand_m: report.mapping.hand_m.into(),
         tip_m: report.mapping.tip_m.into(),
+        hand_q: report.mapping.hand_orientation.as_ref().map(scalar_first),
+        tip_q: scalar_first(&report.mapping.tip_orientation),
     }
 }
 
@@ -399,12 +403,14 @@ impl Recorder {
         let (queue, reports) = sync_channel::<Report>(QUEUE);
         let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
             let mut out = std::io::BufWriter::new(file);
-            write!(out, "tick,mono_ns,state,engagement,age_s,clamps,tip_x,tip_y,tip_z,target_x,target_y,target_z")?;
+            write!(out, "tick,mono_ns,state,engagement,age_s,clamps,tip_x,tip_y,tip_z,target_x,target_y,target_z,tip_qw,tip_qx,tip_qy,tip_qz,opening")?;
             (0..dof).try_for_each(|i| write!(out, ",q{i}"))?;
             writeln!(out)?;
             for r in reports {
                 write!(out, "{},{},{:?},{},{:.6},{}", r.tick, r.at.0, r.state, r.engagement.number, r.age_s, r.clamps)?;
-                r.tip_m.iter().chain(&r.target_m).try_for_each(|v| write!(out, ",{v:.6}"))?;
+                let q = &r.orientation;
+                let turn = [q.w, q.i, q.j, q.k, r.opening];
+                r.tip_m.iter().chain(&r.target_m).chain(&turn).try_for_each(|v| write!(out, ",{v:.6}"))?;
                 r.q.iter().take(dof).try_for_each(|v| write!(out, ",{v:.6}"))?;
                 writeln!(out)?;
             }

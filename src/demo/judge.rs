@@ -14,13 +14,21 @@ use telemime_robot::servo::{Mapping, RAMP_S};
 
 use super::processes::Run;
 use super::{Args, Material};
-use crate::measure::{Track, follow, is_edge, rmse_m, sample_and_hold};
+use crate::measure::{Hand, Track, Turns, follow, is_edge, rmse_m, sample_and_hold};
 
 /// One way of following the hand.
 pub(super) struct Way {
     pub(super) track: Track,
     pub(super) rmse_m: f64,
     pub(super) lag_s: f64,
+}
+
+/// How far the orientation was off, each way of following it, rad RMS.
+pub(super) struct TurnVerdict {
+    pub(super) delayed_rad: f64,
+    pub(super) delayed_arm_rad: f64,
+    pub(super) floor_rad: f64,
+    pub(super) predicted_rad: f64,
 }
 
 /// The figures of a run.
@@ -37,6 +45,8 @@ pub(super) struct Verdict {
     pub(super) floor: Way,
     /// What the robot did.
     pub(super) predicted: Way,
+    /// The same for the orientation, where the recording has it and the arm followed it.
+    pub(super) turn: Option<TurnVerdict>,
     pub(super) clamps: u32,
     pub(super) coasted: u32,
     /// Ticks between the first and the last recorded that the record does not hold.
@@ -90,6 +100,7 @@ pub(super) struct Tick {
     tick: u64,
     pub(super) mono_ns: i64,
     pub(super) tip_m: Vector3<f64>,
+    tip_q: UnitQuaternion<f64>,
     pub(super) clamps: u32,
 }
 
@@ -107,6 +118,12 @@ pub(super) fn read_ticks(path: &Path, from_ns: i64) -> anyhow::Result<Vec<Tick>>
     let (tick, mono, clamps) = (column("tick")?, column("mono_ns")?, column("clamps")?);
     let engagement = column("engagement")?;
     let tip = [column("tip_x")?, column("tip_y")?, column("tip_z")?];
+    let [w, i, j, k] = [
+        column("tip_qw")?,
+        column("tip_qx")?,
+        column("tip_qy")?,
+        column("tip_qz")?,
+    ];
     let (mut ticks, mut first) = (Vec::new(), None);
     for row in reader.records() {
         let row = row?;
@@ -118,7 +135,14 @@ pub(super) fn read_ticks(path: &Path, from_ns: i64) -> anyhow::Result<Vec<Tick>>
                 row[tip[1]].parse()?,
                 row[tip[2]].parse()?,
             );
+            let tip_q = Quaternion::new(
+                row[w].parse()?,
+                row[i].parse()?,
+                row[j].parse()?,
+                row[k].parse()?,
+            );
             ticks.push(Tick {
+                tip_q: UnitQuaternion::from_quaternion(tip_q),
                 tick: row[tick].parse()?,
                 mono_ns,
                 tip_m,
@@ -138,12 +162,17 @@ pub(super) fn engagement(run: &Run) -> anyhow::Result<(Mapping, i64)> {
         Robot::Engaged {
             mono_ns,
             scale,
-            rotation: [w, x, y, z],
+            rotation,
             hand_m,
             tip_m,
+            hand_q,
+            tip_q,
             ..
         } => {
-            let rotation = UnitQuaternion::from_quaternion(Quaternion::new(*w, *x, *y, *z));
+            let unit = |[w, x, y, z]: [f64; 4]| {
+                UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z))
+            };
+            let rotation = unit(*rotation);
             let (hand_m, tip_m) = (Vector3::from(*hand_m), Vector3::from(*tip_m));
             Some((
                 Mapping {
@@ -151,8 +180,8 @@ pub(super) fn engagement(run: &Run) -> anyhow::Result<(Mapping, i64)> {
                     rotation,
                     hand_m,
                     tip_m,
-                    hand_orientation: None,
-                    tip_orientation: UnitQuaternion::identity(),
+                    hand_orientation: hand_q.map(unit),
+                    tip_orientation: unit(*tip_q),
                 },
                 *mono_ns,
             ))
@@ -212,8 +241,24 @@ pub(super) fn judge(args: &Args, material: &Material, run: &Run) -> anyhow::Resu
         .last()
         .map_or(0, |t| t.clamps);
 
+    let turned = samples
+        .iter()
+        .map(|s| Some((s.t_s - t0_s, s.orientation?)))
+        .collect::<Option<Vec<_>>>();
+    let true_turn = turned.and_then(Turns::new);
+    let tip_turn = ticks
+        .iter()
+        .map(|t| Some((time_s(t.mono_ns), mapping.unorient(&t.tip_q)?)))
+        .collect::<Option<Vec<_>>>();
+    let tip_turn = tip_turn.and_then(Turns::new);
+
     let arrivals = raw_arrivals(run, &truth, zero_ns);
-    let held = |t_s: f64| sample_and_hold(&arrivals, t_s).unwrap_or(truth.at(0.0));
+    let newest = |t_s: f64| sample_and_hold(&arrivals, t_s).unwrap_or(0.0);
+    let held = |t_s: f64| truth.at(newest(t_s));
+    let seen = |t_s: f64| Hand {
+        place: truth.at(t_s),
+        turn: true_turn.as_ref().map(|turn| turn.at(t_s)),
+    };
     let delayed = Track::new(grid_s.iter().map(|&t| (t, held(t))).collect())?;
     let way = |track: Track| Way {
         rmse_m: rmse_m(&track, &truth, &grid_s),
@@ -222,19 +267,29 @@ pub(super) fn judge(args: &Args, material: &Material, run: &Run) -> anyhow::Resu
     };
     let lag_s = rig.lag_s();
     let start_s = engaged_s.min(0.0);
-    let delayed_arm = follow(&rig, &mapping, start_s, end_s, |t| Some(held(t))).tip;
-    let floor = follow(&rig, &mapping, start_s, end_s, |t| {
-        Some(truth.at(t + lag_s))
-    })
-    .tip;
+    let delayed_arm = follow(&rig, &mapping, start_s, end_s, |t| Some(seen(newest(t))));
+    let floor = follow(&rig, &mapping, start_s, end_s, |t| Some(seen(t + lag_s)));
+    let turn = match (&true_turn, &tip_turn, &delayed_arm.turn, &floor.turn) {
+        (Some(truth), Some(tip), Some(delayed_arm), Some(floor)) => {
+            let held = grid_s.iter().map(|&t| (t, truth.at(newest(t)))).collect();
+            Turns::new(held).map(|held| TurnVerdict {
+                delayed_rad: held.rmse_rad(truth, &grid_s),
+                delayed_arm_rad: delayed_arm.rmse_rad(truth, &grid_s),
+                floor_rad: floor.rmse_rad(truth, &grid_s),
+                predicted_rad: tip.rmse_rad(truth, &grid_s),
+            })
+        }
+        _ => None,
+    };
 
     let path = received_path(run);
     let (path_error_m, path_samples) = path_error(&path, &truth, zero_ns, run);
     Ok(Verdict {
         mapping,
         delayed: way(delayed),
-        delayed_arm: way(delayed_arm),
-        floor: way(floor),
+        delayed_arm: way(delayed_arm.tip),
+        floor: way(floor.tip),
+        turn,
         predicted: way(tip),
         clamps,
         ticks_lost: missing(&ticks),
@@ -254,9 +309,9 @@ fn count_state(run: &Run, name: &str) -> u32 {
         .count() as u32
 }
 
-/// When each raw sample would have arrived: with the fate that the relay recorded for the packet
+/// When each raw sample would have arrived, and its own time twice: with the fate that the relay recorded for the packet
 /// that passed it next to the sample's time.
-fn raw_arrivals(run: &Run, truth: &Track, zero_ns: i64) -> Vec<(f64, f64, Vector3<f64>)> {
+fn raw_arrivals(run: &Run, truth: &Track, zero_ns: i64) -> Vec<(f64, f64, f64)> {
     let mut up: Vec<_> = run
         .passages
         .iter()
@@ -282,7 +337,7 @@ fn raw_arrivals(run: &Run, truth: &Track, zero_ns: i64) -> Vec<(f64, f64, Vector
     truth
         .points()
         .iter()
-        .filter_map(|&(t_s, x)| fate(t_s).map(|delay_s| (t_s + delay_s, t_s, x)))
+        .filter_map(|&(t_s, _)| fate(t_s).map(|delay_s| (t_s + delay_s, t_s, t_s)))
         .collect()
 }
 
@@ -356,6 +411,7 @@ mod tests {
             tick,
             mono_ns: 0,
             tip_m: Vector3::zeros(),
+            tip_q: UnitQuaternion::identity(),
             clamps: 0,
         }
     }

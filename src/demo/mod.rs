@@ -10,10 +10,10 @@ mod summary;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use nalgebra::Vector3;
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use telemime_operator::cli::Axes;
 use telemime_operator::demonstration::{Demonstration, Demonstrations, Sample};
-use telemime_sim::hand::swing;
+use telemime_sim::hand::swing_with_wrist;
 
 use crate::cli::Shape;
 
@@ -53,6 +53,9 @@ pub(crate) struct Args {
     /// Which person performs, and how.
     #[arg(long, default_value_t = 7)]
     seed: u64,
+    /// The generated performances have the hand's orientation too.
+    #[arg(long, conflicts_with = "demos")]
+    wrist: bool,
     #[command(flatten)]
     link: Shape,
     /// Where figures and logs go.
@@ -96,7 +99,7 @@ fn material(args: &Args, scratch: &Path) -> anyhow::Result<Material> {
         if args.replay.is_some() {
             bail!("--replay needs --demos: which recordings is the skill learned from?");
         }
-        return generated(args.seed, scratch);
+        return generated(args, scratch);
     };
     let found = Demonstrations::read_dir(&demos, args.matching.as_deref())?;
     let (replay, recording) = match &args.replay {
@@ -126,14 +129,21 @@ fn material(args: &Args, scratch: &Path) -> anyhow::Result<Material> {
 }
 
 /// A synthetic person waving: performances 0 to 4 to learn from, 5 to drive.
-fn generated(seed: u64, scratch: &Path) -> anyhow::Result<Material> {
+fn generated(args: &Args, scratch: &Path) -> anyhow::Result<Material> {
     let demos = scratch.join("swing");
     std::fs::create_dir(&demos)?;
     let replay = scratch.join("unseen.csv");
     for index in 0..=PERFORMANCES {
-        let samples: Vec<_> = swing(seed, index)
+        let samples: Vec<_> = swing_with_wrist(args.seed, index)
             .into_iter()
-            .map(|(t_s, x)| Sample::at(t_s, Vector3::from(x)))
+            .map(|pose| {
+                let [w, x, y, z] = pose.q;
+                let q = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+                Sample {
+                    orientation: args.wrist.then_some(q),
+                    ..Sample::at(pose.t_s, Vector3::from(pose.x))
+                }
+            })
             .collect();
         let path = if index < PERFORMANCES {
             demos.join(format!("{index}.csv"))

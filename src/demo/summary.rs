@@ -11,8 +11,9 @@ use super::judge::Verdict;
 use super::processes::Run;
 use super::{Args, Material};
 
-/// Bytes of a raw sample: four f32 and the headers of IP and UDP.
+/// Bytes of a raw sample: four f32 (four more for an orientation) and the headers of IP and UDP.
 const RAW_SAMPLE: u64 = 4 * 4 + 28;
+const RAW_TURN: u64 = 4 * 4;
 
 /// Kept stable: fields are added, not changed.
 #[derive(Debug, Serialize)]
@@ -24,6 +25,7 @@ struct Result {
     rmse_floor_m: f64,
     rmse_predicted_m: f64,
     fraction_hidden: Option<f64>,
+    turn: Option<Turn>,
     lags_at_edge: Vec<&'static str>,
     lag_delayed_ms: f64,
     lag_delayed_same_arm_ms: f64,
@@ -51,6 +53,15 @@ struct Result {
     tick_p99_us: f64,
     overruns: u32,
     ticks_lost: u64,
+}
+
+/// The orientation's errors, rad RMS.
+#[derive(Debug, Clone, Copy, Serialize)]
+struct Turn {
+    rmse_delayed_rad: f64,
+    rmse_delayed_same_arm_rad: f64,
+    rmse_floor_rad: f64,
+    rmse_predicted_rad: f64,
 }
 
 #[derive(Debug, Clone, Copy, Serialize)]
@@ -159,6 +170,12 @@ fn gather(
         rmse_floor_m: verdict.floor.rmse_m,
         rmse_predicted_m: verdict.predicted.rmse_m,
         fraction_hidden: verdict.fraction_hidden(),
+        turn: verdict.turn.as_ref().map(|turn| Turn {
+            rmse_delayed_rad: turn.delayed_rad,
+            rmse_delayed_same_arm_rad: turn.delayed_arm_rad,
+            rmse_floor_rad: turn.floor_rad,
+            rmse_predicted_rad: turn.predicted_rad,
+        }),
         lags_at_edge: verdict.lags_at_edge(),
         lag_delayed_ms: verdict.delayed.lag_s * 1e3,
         lag_delayed_same_arm_ms: verdict.delayed_arm.lag_s * 1e3,
@@ -168,7 +185,8 @@ fn gather(
         clamps: verdict.clamps,
         coasted: verdict.coasted,
         bytes_on_wire: *bytes_on_wire,
-        bytes_raw: RAW_SAMPLE * u64::from(*samples),
+        bytes_raw: (RAW_SAMPLE + u64::from(verdict.turn.is_some()) * RAW_TURN)
+            * u64::from(*samples),
         bytes_session: Session {
             operator_to_robot: *bytes_session_up,
             robot_to_operator: *bytes_session_down,
@@ -199,6 +217,16 @@ fn table(r: &Result) -> String {
         || "the delay costs too little to tell".to_owned(),
         |share| format!("{:.0} % of the delay's cost hidden", share * 1e2),
     );
+    let turn = r.turn.map_or_else(String::new, |t| {
+        let degrees = |rad: f64| format!("{:.2}°", rad.to_degrees());
+        format!(
+            "orientation   RMS: delayed {}, through the arm {}; predicted {}; floor {}\n",
+            degrees(t.rmse_delayed_rad),
+            degrees(t.rmse_delayed_same_arm_rad),
+            degrees(t.rmse_predicted_rad),
+            degrees(t.rmse_floor_rad)
+        )
+    });
     let clock = r.clock_bound_ms.map_or_else(String::new, |ms| {
         format!(", session clock known to ±{ms:.0} ms")
     });
@@ -209,7 +237,7 @@ fn table(r: &Result) -> String {
          as sent, delayed, through the arm    {}   {}\n\
          predicted                            {}   {}   {}\n\
          floor: perfect knowledge, same arm   {}   {}\n\n\
-         on the wire   {} B of motion in {} messages; raw streaming {} B; ratio {:.2}\n\
+         {turn}on the wire   {} B of motion in {} messages; raw streaming {} B; ratio {:.2}\n\
          path          {} checkpoints for {} samples; within {} of the hand ({} promised)\n\
          session       {} B up, {} B down besides (keys, model, acknowledgements, telemetry){clock}\n\
          servo         {:.1} µs a tick, {:.1} µs p99, {} late, {} not recorded; a limit acted on {} ticks; coasted {} times\n",

@@ -2,6 +2,8 @@
 
 mod follow;
 mod track;
+mod turns;
 
-pub use follow::{Follow, follow};
+pub use follow::{Follow, Hand, follow};
 pub use track::{Track, TrackError, is_edge, rmse_m, sample_and_hold};
+pub use turns::Turns;

@@ -95,8 +95,8 @@ pub fn rmse_m(a: &Track, b: &Track, grid_s: &[f64]) -> f64 {
 }
 
 /// The newest sample that has arrived by `t_s`: what a robot that holds the last sample would know.
-/// `arrivals` are (arrival, sample time, position); a sample overtaken by a newer one is not used.
-pub fn sample_and_hold(arrivals: &[(f64, f64, Vector3<f64>)], t_s: f64) -> Option<Vector3<f64>> {
+/// `arrivals` are (arrival s, sample time s, what was sampled); a sample overtaken by a newer one is not used.
+pub fn sample_and_hold<T: Copy>(arrivals: &[(f64, f64, T)], t_s: f64) -> Option<T> {
     arrivals
         .iter()
         .filter(|(arrival, ..)| *arrival <= t_s)

@@ -2,7 +2,7 @@
 
 use nalgebra::Vector3;
 use telemime::ground::{Pair, run_virtual};
-use telemime::measure::{Track, follow, rmse_m, sample_and_hold};
+use telemime::measure::{Hand, Track, follow, rmse_m, sample_and_hold};
 use telemime_operator::daemon::{Notice, Summary};
 use telemime_operator::task::Outcome;
 use telemime_protocol::spline::HermiteSpan;
@@ -92,11 +92,11 @@ fn the_tip_moves_with_the_hand() {
         .collect();
     let from_s = tip.span_s().0;
     let same_arm = follow(&rig, &mapping, from_s, end_s, |t| {
-        sample_and_hold(&arrivals, t)
+        sample_and_hold(&arrivals, t).map(Hand::from)
     })
     .tip;
     let ahead = follow(&rig, &mapping, from_s, end_s, |t| {
-        Some(hand.at(t + rig.lag_s()))
+        Some(hand.at(t + rig.lag_s()).into())
     });
 
     let error = |track: &Track| rmse_m(track, &hand, &grid);

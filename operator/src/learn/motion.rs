@@ -18,7 +18,7 @@ const LADDER: [usize; 20] = [
     1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20, 24, 28, 33, 39, 46, 54, 64,
 ];
 
-/// Rows (t s, x m, y m, z m) of each demonstration, evenly thinned to about [`MOST_ROWS`] in all.
+/// Rows (t s, x m, y m, z m) of each demonstration, evenly thinned to about 2000 in all.
 pub fn rows(aligned: &Aligned) -> Vec<Vec<Vector4<f64>>> {
     let total = aligned.paths.len() * aligned.times_s.len();
     let step = total.div_ceil(MOST_ROWS);

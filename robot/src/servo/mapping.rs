@@ -69,6 +69,12 @@ impl Mapping {
         turned * self.tip_orientation
     }
 
+    /// The hand's orientation that [`Mapping::orient`] would turn to `tip`; `None` if none is followed.
+    pub fn unorient(&self, tip: &UnitQuaternion<f64>) -> Option<UnitQuaternion<f64>> {
+        let turned = tip * self.tip_orientation.inverse();
+        Some(self.rotation.inverse() * turned * self.rotation * self.hand_orientation?)
+    }
+
     /// The hand position that [`Mapping::place`] would put at `tip_m`.
     pub fn unplace(&self, tip_m: Vector3<f64>) -> Vector3<f64> {
         self.hand_m + self.rotation.inverse() * (tip_m - self.tip_m) / self.scale

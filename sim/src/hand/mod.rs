@@ -29,6 +29,10 @@ const SKEW_SD: f64 = 0.28;
 
 /// Seed streams: the person, and each performance, draw from their own.
 const PERFORMANCE_STREAM: u64 = 0x9e37_79b9_7f4a_7c15;
+const WRIST_STREAM: u64 = 0x5851_f42d_4c95_7f2d;
+
+/// Error of a tracked orientation about each axis, rad.
+const TRACKER_RAD: f64 = 5e-3;
 
 /// One performance of an arm swing: (time s, position m), about 30 Hz, 6 to 10 s long, starting at 0 s and at rest.
 ///
@@ -45,19 +49,82 @@ const PERFORMANCE_STREAM: u64 = 0x9e37_79b9_7f4a_7c15;
 /// assert!(swing.last().is_some_and(|&(t_s, _)| (6.0..10.0).contains(&t_s)));
 /// ```
 pub fn swing(seed: u64, index: u32) -> Vec<(f64, [f64; 3])> {
+    let (frames, _) = frames(seed, index);
+    frames
+}
+
+/// [`swing`] with the wrist: the same times and positions, and the orientation (w, x, y, z) of the hand in the sensor's axes.
+///
+/// The hand rolls by a fifth of the angle by which the forearm leans from upright, and pitches and turns a little with it: as one holds a tool that an arm
+/// can turn as fast, for rotation is not scaled. The tracker errs by 0.3° about each axis.
+///
+/// ```
+/// let poses = telemime_sim::hand::swing_with_wrist(7, 0);
+/// let positions: Vec<_> = poses.iter().map(|p| (p.t_s, p.x)).collect();
+/// assert_eq!(positions, telemime_sim::hand::swing(7, 0));
+/// ```
+pub fn swing_with_wrist(seed: u64, index: u32) -> Vec<Pose> {
+    let (frames, leans) = frames(seed, index);
+    let mut rng = stream(seed ^ WRIST_STREAM, u64::from(index) + 1);
+    frames
+        .into_iter()
+        .zip(leans)
+        .map(|((t_s, x), lean)| {
+            let mut err = || TRACKER_RAD * normal(&mut rng);
+            let roll = about([0.0, 0.0, 1.0], -0.2 * lean + err());
+            let pitch = about([1.0, 0.0, 0.0], 0.08 * lean + err());
+            let turn = about([0.0, 1.0, 0.0], 0.1 * lean.sin() + err());
+            Pose {
+                t_s,
+                x,
+                q: product(product(roll, pitch), turn),
+            }
+        })
+        .collect()
+}
+
+/// A hand at one moment.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pose {
+    /// When, s.
+    pub t_s: f64,
+    /// Where, m.
+    pub x: [f64; 3],
+    /// How it is turned: w, x, y, z, from its own axes to the sensor's.
+    pub q: [f64; 4],
+}
+
+fn about(axis: [f64; 3], angle: f64) -> [f64; 4] {
+    let (sine, cosine) = (0.5 * angle).sin_cos();
+    [cosine, axis[0] * sine, axis[1] * sine, axis[2] * sine]
+}
+
+fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
+    [
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    ]
+}
+
+/// A performance as the sensor sees it, and the forearm's true lean from upright (rad) in every frame.
+fn frames(seed: u64, index: u32) -> (Vec<(f64, [f64; 3])>, Vec<f64>) {
     let person = Person::new(seed);
     let mut rng = stream(seed, u64::from(index) + 1);
     let path = Performance::new(&person, index, &mut rng);
-    let mut out = Vec::new();
+    let elbow: [f64; 2] = core::array::from_fn(|i| person.pivot[i] + path.offset[i]);
+    let (mut out, mut leans) = (Vec::new(), Vec::new());
     let mut frame = 0_u32;
     loop {
         let nominal = f64::from(frame) * FRAME_S;
         let jitter = (0.7e-3 * normal(&mut rng)).clamp(-3e-3, 3e-3);
         let t_s = if frame == 0 { 0.0 } else { nominal + jitter };
         if t_s > path.duration_s() {
-            return out;
+            return (out, leans);
         }
         let mut x = path.at(t_s);
+        leans.push((x[0] - elbow[0]).atan2(x[1] - elbow[1]));
         let before = path.at(t_s - 0.5 * FRAME_S);
         let moved: f64 = (0..3).map(|i| (x[i] - before[i]).powi(2)).sum();
         // A frame's exposure smears a fast hand: the tracker errs along with its speed.
@@ -68,6 +135,18 @@ pub fn swing(seed: u64, index: u32) -> Vec<(f64, [f64; 3])> {
         out.push((t_s, x));
         frame += 1;
     }
+}
+
+/// When the hand of [`swing`] turns, s: from the end of raising it on, every time it changes sides. Two turns are one swing to and fro.
+///
+/// ```
+/// let turns = telemime_sim::hand::turns(7, 0);
+/// assert!(turns.len() > 12 && turns.is_sorted());
+/// ```
+pub fn turns(seed: u64, index: u32) -> Vec<f64> {
+    let mut rng = stream(seed, u64::from(index) + 1);
+    let path = Performance::new(&Person::new(seed), index, &mut rng).turns;
+    path.iter().map(|turn| turn.t_s).collect()
 }
 
 fn stream(seed: u64, n: u64) -> Xoshiro256PlusPlus {
@@ -276,6 +355,29 @@ mod tests {
         assert_eq!(swing(3, 1), swing(3, 1));
         assert_ne!(swing(3, 1), swing(3, 2));
         assert_ne!(swing(3, 1), swing(4, 1));
+    }
+
+    #[test]
+    fn the_wrist_turns_smoothly_and_by_a_lot() {
+        for seed in 0..10 {
+            let poses = swing_with_wrist(seed, 2);
+            assert_eq!(poses, swing_with_wrist(seed, 2));
+            let apart = |a: &Pose, b: &Pose| {
+                let dot: f64 = a.q.iter().zip(b.q).map(|(a, b)| a * b).sum();
+                2.0 * dot.abs().min(1.0).acos()
+            };
+            let norm = |p: &Pose| p.q.iter().map(|v| v * v).sum::<f64>();
+            assert!(poses.iter().all(|p| (norm(p) - 1.0).abs() < 1e-12));
+            let step = poses
+                .windows(2)
+                .map(|w| apart(&w[0], &w[1]))
+                .fold(0.0, f64::max);
+            let range = poses
+                .iter()
+                .map(|p| apart(p, &poses[0]))
+                .fold(0.0, f64::max);
+            assert!(step < 0.2 && range > 0.4, "{step} {range}");
+        }
     }
 
     #[test]

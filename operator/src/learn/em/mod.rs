@@ -209,8 +209,9 @@ impl fmt::Display for Degenerate {
             }
             Self::Floored { axis, components } => write!(
                 f,
-                "coordinate {axis} follows from those before it in {components} components; its \
-                 variance is held at the floor"
+                "coordinate {axis} follows from those before it in {components} component{}; its \
+                 variance is held at the floor",
+                if components == 1 { "" } else { "s" }
             ),
             Self::Shrunk {
                 component,

@@ -102,10 +102,9 @@ impl<const D: usize> Kernel<D> {
             for v in &mut e {
                 *v -= self.mean[i];
             }
-            for j in 0..i {
-                let f = self.factor[i][j];
+            for (f, z) in self.factor[i][..i].iter().zip(&z) {
                 for l in 0..LANES {
-                    e[l] -= f * z[j][l];
+                    e[l] -= f * z[l];
                 }
             }
             for l in 0..LANES {
@@ -162,8 +161,8 @@ impl<const D: usize> Accumulator<D> {
 
     fn add(&mut self, r: &Lanes, x: &[Lanes; D], reference: &[f64; D]) {
         let mut e = [[0.0; LANES]; D];
-        for l in 0..LANES {
-            self.n[l] += r[l];
+        for (n, r) in self.n.iter_mut().zip(r) {
+            *n += r;
         }
         for i in 0..D {
             let mut w = [0.0; LANES];
@@ -172,10 +171,9 @@ impl<const D: usize> Accumulator<D> {
                 w[l] = r[l] * e[i][l];
                 self.first[i][l] += w[l];
             }
-            for j in 0..=i {
-                let to = &mut self.second[i][j];
+            for (to, e) in self.second[i].iter_mut().zip(&e[..=i]) {
                 for l in 0..LANES {
-                    to[l] += w[l] * e[j][l];
+                    to[l] += w[l] * e[l];
                 }
             }
         }
@@ -256,10 +254,10 @@ fn chunk_pass<const D: usize>(
         }
         // Which components a tile has anything to say about.
         let mut concerned = [0_u64; BLOCK];
-        for t in 0..block.len() {
+        for (t, concerned) in concerned.iter_mut().enumerate().take(block.len()) {
             let is_last = index * BLOCK + t + 1 == tiles.len();
             let counted = LANES - if is_last { fill } else { 0 };
-            log_likelihood += normalise(&mut shares, t, counted, &mut concerned[t]);
+            log_likelihood += normalise(&mut shares, t, counted, concerned);
         }
         for (c, (sum, shares)) in sums.iter_mut().zip(&shares).enumerate() {
             for ((x, r), concerned) in block.iter().zip(shares).zip(&concerned) {
@@ -326,8 +324,8 @@ fn normalise(shares: &mut [[Lanes; BLOCK]], t: usize, counted: usize, concerned:
 fn exp(x: &Lanes) -> Lanes {
     /// 1.5·2⁵²: adding it leaves the nearest integer in the low bits.
     const ROUND: f64 = 6_755_399_441_055_744.0;
-    const LN2_HIGH: f64 = 6.931_471_803_691_238_16e-1;
-    const LN2_LOW: f64 = 1.908_214_929_270_587_70e-10;
+    const LN2_HIGH: f64 = 6.931_471_803_691_238e-1;
+    const LN2_LOW: f64 = 1.908_214_929_270_587_7e-10;
     const TAYLOR: [f64; 13] = [
         1.0 / 479_001_600.0,
         1.0 / 39_916_800.0,

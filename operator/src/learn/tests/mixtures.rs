@@ -291,7 +291,7 @@ fn performance(seed: u64) -> Vec<Vector2<f64>> {
     (0..120)
         .map(|i| {
             let t = f64::from(i) / 119.0;
-            let noise = (f64::from(i) * 12.9898 + seed as f64 * 78.233).sin() * 43_758.5453;
+            let noise = (f64::from(i) * 12.9898 + seed as f64 * 78.233).sin() * 43_758.545_3;
             let noise = noise - noise.floor() - 0.5;
             Vector2::new(
                 t,

@@ -104,6 +104,9 @@ fn same_as_scikit_learn<const D: usize>(name: &str) {
     assert!((all.score - number(&v["score"])).abs() < 1e-6);
     let k = all.gmm.components().len();
     assert!((select::bic(k, D, all.score, data.len()) - number(&v["bic"])).abs() < 1e-3);
+    let parameters = em::Covariance::Full.parameters(k, D) as f64;
+    let aic = -2.0 * all.score * data.len() as f64 + 2.0 * parameters;
+    assert!((aic - number(&v["aic"])).abs() < 1e-3);
 }
 
 #[test]
