@@ -1,45 +1,69 @@
 //! `telemime learn` and `telemime inspect`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
+use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
-use nalgebra::SVector;
-use telemime_operator::demonstration::Demonstrations;
-use telemime_operator::learn::{LearnOptions, Progress, learn_skill};
+use telemime_operator::demonstration::{Demonstration, Demonstrations};
+use telemime_operator::learn::{LearnOptions, Progress, learn_skill, refine};
+use telemime_operator::placed::{Motion, Placed};
 use telemime_operator::skill_file;
-use telemime_protocol::skill::{Gmr, Skill};
+use telemime_protocol::skill::Skill;
 
 /// Learn a skill from a folder of demonstrations (CSV: t,x,y,z; one file each) and save it.
+///
+/// With --update, refine a saved skill by further demonstrations, without those it was learned from.
 #[derive(clap::Args, Debug)]
 pub(crate) struct LearnArgs {
-    /// The folder; its name becomes the skill's.
-    dir: PathBuf,
-    /// Where to save the skill [default: NAME.skill].
+    /// The folder; its name becomes the skill's. With --update, folders or files to refine it by.
+    #[arg(value_name = "DIR", required = true)]
+    dirs: Vec<PathBuf>,
+    /// Where to save the skill [default: NAME.skill; with --update, the file that is refined].
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Only the files whose names match this pattern (* stands for anything).
     #[arg(long = "match", value_name = "PATTERN")]
     matching: Option<String>,
+    /// Learn the motion relative to these frames too, so that they can be moved when it is played: start and goal are where
+    /// a recording begins and ends; others are where its lines `# frame NAME x y z [qw qx qy qz]` say.
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',', conflicts_with = "update")]
+    frames: Vec<String>,
+    /// Refine this skill; each new demonstration weighs as much as each it was learned from.
+    #[arg(long, value_name = "SKILL")]
+    update: Option<PathBuf>,
     /// Seed of every random choice.
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, conflicts_with = "update")]
     seed: u64,
 }
+
+/// A frame that was less than this about its usual place shows nothing of what moves with it, root mean square, m.
+const LEAST_SPREAD_M: f64 = 0.01;
 
 /// Show what a saved skill holds.
 #[derive(clap::Args, Debug)]
 pub(crate) struct InspectArgs {
     /// The skill file.
     file: PathBuf,
+    /// Show the motion with this frame placed anew, m in the recordings' axes; may be repeated.
+    #[arg(long, value_name = "NAME=x,y,z[,qw,qx,qy,qz]")]
+    frame: Vec<Placed>,
 }
 
 pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
-    let found = Demonstrations::read_dir(&args.dir, args.matching.as_deref())?;
+    if let Some(old) = &args.update {
+        return update(args, old);
+    }
+    let [dir] = args.dirs.as_slice() else {
+        bail!("one folder makes one skill; with --update several refine one");
+    };
+    let found = Demonstrations::read_dir(dir, args.matching.as_deref())?;
     found
         .notices
         .iter()
         .for_each(|notice| eprintln!("note: {notice}"));
     let options = LearnOptions {
         seed: args.seed,
+        frames: args.frames.clone(),
         ..LearnOptions::default()
     };
     let bar = ProgressBar::new_spinner();
@@ -47,6 +71,7 @@ pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
         bar.set_style(style);
     }
     let mut degenerate = Vec::new();
+    let mut still = Vec::new();
     let skill = learn_skill(&found.name, &found.demonstrations, &options, |progress| {
         if let Progress::Motion {
             degenerate: found, ..
@@ -54,10 +79,16 @@ pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
         {
             degenerate.clone_from(found);
         }
+        if let Progress::Frame { name, spread_m, .. } = &progress
+            && *spread_m < LEAST_SPREAD_M
+        {
+            still.push((name.clone(), *spread_m));
+        }
         bar.set_message(match progress {
             Progress::Aligned { medoid, .. } => format!("aligned to {medoid}"),
             Progress::Candidate(candidate) => format!("motion: {candidate:?}"),
             Progress::Motion { components, .. } => format!("motion: {components} components"),
+            Progress::Frame { name, .. } => format!("motion as seen from {name}"),
             Progress::Held { done, of } => format!("calibrating, {done} of {of}"),
             Progress::Predictor { components, .. } => format!("predictor: {components} components"),
         });
@@ -67,6 +98,12 @@ pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
     for what in degenerate {
         eprintln!("note: the motion's mixture over (t, x, y, z): {what}");
     }
+    for (name, spread_m) in still {
+        eprintln!(
+            "note: frame {name} was within {:.0} mm of one place: what moves with it is a guess; demonstrate with it elsewhere",
+            spread_m * 1e3
+        );
+    }
     let path = args
         .output
         .clone()
@@ -75,6 +112,56 @@ pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
     describe(&skill);
     say!("saved to {}", path.display());
     Ok(())
+}
+
+/// `telemime learn --update`: each demonstration in turn, and then one file, whole.
+fn update(args: &LearnArgs, old: &Path) -> anyhow::Result<()> {
+    let mut skill = skill_file::load(old)?;
+    let mut demonstrations = Vec::new();
+    for path in &args.dirs {
+        if path.is_dir() {
+            let found = Demonstrations::read_dir(path, args.matching.as_deref())?;
+            demonstrations.extend(found.demonstrations);
+        } else {
+            demonstrations.push(Demonstration::read_csv(path)?);
+        }
+    }
+    for d in &demonstrations {
+        d.notices()
+            .iter()
+            .for_each(|notice| eprintln!("note: {notice}"));
+        let (refined, what) = refine(&skill, d)
+            .with_context(|| format!("{} is unchanged", old.display()))?;
+        if what.is_unlike() {
+            eprintln!(
+                "note: {} is unlike what {} has seen: {:.0} % of it is newer than 90 % of a usual performance; if it is another gesture, learn it as a skill of its own",
+                what.name,
+                skill.name(),
+                what.novel * 100.0
+            );
+        }
+        for ignored in what.ignored {
+            eprintln!(
+                "note: {} has {ignored}, which {} was not taught: it is not learned",
+                what.name,
+                skill.name()
+            );
+        }
+        skill = refined;
+    }
+    let path = args.output.as_deref().unwrap_or(old);
+    skill_file::save(&skill, path)?;
+    describe(&skill);
+    say!(
+        "refined by {}, saved to {}",
+        plural(demonstrations.len(), "demonstration"),
+        path.display()
+    );
+    Ok(())
+}
+
+fn plural(n: usize, what: &str) -> String {
+    format!("{n} {what}{}", if n == 1 { "" } else { "s" })
 }
 
 pub(crate) fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
@@ -87,11 +174,11 @@ pub(crate) fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
             source.name
         );
     }
-    let gmr = Gmr::<1, 3>::new(skill.motion())?;
+    let motion = Motion::new(&skill, &args.frame)?;
     say!("inferred motion (t s, x y z m, deviation of each m):");
     for i in 0..=10 {
         let t_s = skill.duration_s() * f64::from(i) / 10.0;
-        let at = gmr.query(&SVector::from([t_s]));
+        let at = motion.at(t_s);
         let deviation = at.covariance.diagonal().map(f64::sqrt);
         say!(
             "  {t_s:7.3}  {:8.4} {:8.4} {:8.4}   ± {:.4} {:.4} {:.4}",
@@ -119,6 +206,21 @@ fn describe(skill: &Skill) {
         skill.duration_s(),
         skill.motion().components().len()
     );
+    for frame in skill.task().iter().flat_map(|task| task.frames()) {
+        let (o, q) = (frame.usual.origin, frame.usual.turn);
+        say!(
+            "  frame {}: {} components; usually at {:.3} {:.3} {:.3} m, turned {:.3} {:.3} {:.3} {:.3} (w x y z)",
+            frame.name,
+            frame.motion.components().len(),
+            o.x,
+            o.y,
+            o.z,
+            q.w,
+            q.i,
+            q.j,
+            q.k
+        );
+    }
     say!(
         "  predictor: {} components over the hand's state, {} knots to {:.2} s",
         predictor.components().len(),
