@@ -11,7 +11,7 @@ use telemime_endpoint::cli::{self as shell, one_line};
 use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
 
 use crate::relay::{Passage, Relay, RelayConfig};
-use crate::{demo, paper, teach};
+use crate::{demo, paper, recognise, teach};
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
 /// network delay behind it.
@@ -34,6 +34,12 @@ enum Command {
     Learn(teach::LearnArgs),
     /// Show what a saved skill holds.
     Inspect(teach::InspectArgs),
+    /// List the skills there are.
+    List(recognise::ListArgs),
+    /// Say which skill a recording shows, moment by moment, or that it is none of them.
+    Recognise(recognise::RecogniseArgs),
+    /// Try recognition on demonstrations held out: which skills are confused, what is refused.
+    Confusion(recognise::ConfusionArgs),
     /// The operator daemon: teach, drive, play.
     Operator(telemime_operator::cli::Args),
     /// The robot daemon: an arm that follows.
@@ -100,6 +106,9 @@ pub fn main() -> ExitCode {
         Some(Command::Demo(args)) => demo::run(args),
         Some(Command::Learn(args)) => teach::learn(args),
         Some(Command::Inspect(args)) => teach::inspect(args),
+        Some(Command::List(args)) => recognise::list(args),
+        Some(Command::Recognise(args)) => recognise::recognise(args),
+        Some(Command::Confusion(args)) => recognise::confusion(args),
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),
         Some(Command::Link(args)) => link(args),

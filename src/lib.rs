@@ -14,5 +14,6 @@ mod figure;
 pub mod ground;
 pub mod measure;
 mod paper;
+mod recognise;
 pub mod relay;
 mod teach;

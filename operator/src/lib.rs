@@ -5,6 +5,7 @@ pub mod cli;
 pub mod daemon;
 pub mod demonstration;
 pub mod learn;
+pub mod recognise;
 pub mod session;
 pub mod skill_file;
 pub mod task;
