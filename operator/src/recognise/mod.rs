@@ -14,6 +14,7 @@
 //! Mahalanobis distance to the nearest component over its 90 % quantile on held-out demonstrations),
 //! is averaged over 0.25 s. Beyond a threshold the motion is none of the known ones.
 
+mod foretold;
 mod known;
 mod phase;
 #[cfg(test)]
@@ -37,7 +38,7 @@ const LONGEST_S: f64 = 0.1;
 const HOLE_S: f64 = 1.0;
 
 /// The average of the novelty reaches this far back, s.
-const NOVELTY_TAU_S: f64 = 0.25;
+const NOVELTY_TAU_S: f64 = 0.3;
 
 /// A hand this near to all its memories rests, m: below it a sensor's noise is all there is to see.
 const REST_M: f64 = 0.02;
@@ -223,12 +224,7 @@ impl Recogniser {
         let memory = dt_s.map_or(0.0, |dt_s| (-dt_s / NOVELTY_TAU_S).exp());
         let resting = rests(state);
 
-        // At rest nothing is seen that could speak for one skill against another.
-        let temper = if resting {
-            0.0
-        } else {
-            self.options.temper * weight
-        };
+        let temper = self.options.temper * weight;
         let f = state.features();
         for ((known, l), novelty) in self
             .known
@@ -236,8 +232,9 @@ impl Recogniser {
             .zip(&mut self.scratch)
             .zip(&mut self.novelty)
         {
-            let (log_density, strange) = known.judge(&f);
-            *l = temper * log_density;
+            let (log_density, strange) = known.judge(state.t, &f);
+            // At rest nothing is seen that could speak for one skill against another.
+            *l = if resting { 0.0 } else { temper * log_density };
             *novelty = memory * *novelty + (1.0 - memory) * strange;
             known.progress(&f, dt_s.unwrap_or(0.0), weight);
         }
