@@ -98,7 +98,7 @@ mod tests {
             let at = x * (t.as_secs_f64() + 0.2);
             f.remember(t, 0.2, at, Matrix3::identity() * (0.01 - LEAST_M2));
         }
-        for ms in [1300, 1304, 1497, 1650] {
+        for ms in [1400, 1404, 1497, 1650] {
             let t = Stamp(ms * 1_000_000);
             let here = x * t.as_secs_f64();
             assert!(f.error(t, &here).unwrap() < 1e-18, "{ms}");
