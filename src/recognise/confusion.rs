@@ -121,13 +121,19 @@ fn show(report: &Report) {
             n.to_string()
         }
     };
-    let heads: String = (1..=report.skills.len()).map(|n| format!("{:>5}", format!("#{n}"))).collect();
+    let heads: String = (1..=report.skills.len())
+        .map(|n| format!("{:>5}", format!("#{n}")))
+        .collect();
     say!(
         "\n     {:width$}{heads}   none   none, when left out   phase ±",
         "performed \\ taken for"
     );
     for (n, s) in report.skills.iter().enumerate() {
-        let row: String = s.taken_for.iter().map(|&n| format!("{:>5}", cell(n))).collect();
+        let row: String = s
+            .taken_for
+            .iter()
+            .map(|&n| format!("{:>5}", cell(n)))
+            .collect();
         say!(
             "{:>4} {:width$}{row}  {:>5}   {:>19}   {:>7}",
             format!("#{}", n + 1),
@@ -140,7 +146,10 @@ fn show(report: &Report) {
     let mut at: Vec<usize> = (0..report.best_right.len()).collect();
     at.sort_by(|&a, &b| report.best_right[a].0.total_cmp(&report.best_right[b].0));
     let row = |what: &str, of: &[(f64, Option<f64>)]| {
-        let cells: String = at.iter().map(|&i| format!("{:>9}", percent(of[i].1))).collect();
+        let cells: String = at
+            .iter()
+            .map(|&i| format!("{:>9}", percent(of[i].1)))
+            .collect();
         say!("{what:44}{cells}");
     };
     let heads: String = at
@@ -149,12 +158,14 @@ fn show(report: &Report) {
         .collect();
     say!("\n{:44}{heads}", "after the onset");
     row("best skill is right", &report.best_right);
-    row("recognised (right, and not refused)", &report.recognised);
-    row("known, but refused", &report.refused_known);
-    row("left out of learning, and refused", &report.refused_left_out);
+    row("recognised: that skill is named", &report.recognised);
+    row("known, but none is named", &report.refused_known);
+    row(
+        "left out of learning, and none is named",
+        &report.refused_left_out,
+    );
     if report.strangers > 0 {
-        row("strangers refused", &report.refused_strangers);
-        row("all unknown refused", &report.refused_unknown);
+        row("strangers, and none is named", &report.refused_strangers);
         say!(
             "strangers were taken for a known skill {} of the time they moved ({} recordings)",
             percent(report.strangers_time_accepted),
@@ -163,11 +174,15 @@ fn show(report: &Report) {
     }
     say!("\nother thresholds, at {} s:", report.at_s);
     for o in &report.roc {
+        let strangers = match o.refused_strangers {
+            Some(share) => format!(", {} of strangers", percent(Some(share))),
+            None => String::new(),
+        };
         say!(
-            "  --reject-above {:<6.3} refuses {:>7} of known, {:>7} of unknown",
+            "  --reject-above {:<6.3} refuses {:>6} of known, {:>6} of left out{strangers}",
             o.reject_above,
             percent(Some(o.refused_known)),
-            percent(o.refused_unknown)
+            percent(o.refused_left_out)
         );
     }
     say!(

@@ -35,7 +35,7 @@ pub(crate) struct RecogniseArgs {
 struct Line<'a> {
     t_s: f64,
     verdict: &'static str,
-    /// The skill recognised; null when resting or unknown.
+    /// The skill recognised; null with every other verdict.
     skill: Option<&'a str>,
     best: Option<&'a str>,
     probability: f64,
@@ -113,6 +113,7 @@ fn line<'a>(r: &Recognition, t_s: f64, name: &impl Fn(usize) -> &'a str) -> Line
     let (verdict, skill) = match r.verdict {
         Verdict::Resting => ("resting", None),
         Verdict::Unknown => ("unknown", None),
+        Verdict::Undecided => ("undecided", None),
         Verdict::Skill(i) => ("skill", Some(name(i))),
     };
     Line {
@@ -147,6 +148,10 @@ fn show<'a>(recording: &Demonstration, stretches: &[Stretch], name: &impl Fn(usi
     for s in stretches {
         let (what, detail) = match s.last.verdict {
             Verdict::Resting => ("at rest", String::new()),
+            Verdict::Undecided => (
+                "undecided",
+                format!("most like {}", s.last.best.map_or("nothing", name)),
+            ),
             Verdict::Unknown => {
                 let like = s.last.best.map_or("nothing", name);
                 (
@@ -164,7 +169,10 @@ fn show<'a>(recording: &Demonstration, stretches: &[Stretch], name: &impl Fn(usi
                 ),
             ),
         };
-        let text = format!("  {:8.3} to {:8.3} s  {what:width$}  {detail}", s.from_s, s.to_s);
+        let text = format!(
+            "  {:8.3} to {:8.3} s  {what:width$}  {detail}",
+            s.from_s, s.to_s
+        );
         say!("{}", text.trim_end());
     }
 }

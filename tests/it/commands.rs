@@ -4,8 +4,17 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 7] = [
-    "demo", "learn", "inspect", "robot", "operator", "link", "paper",
+const COMMANDS: [&str; 10] = [
+    "demo",
+    "learn",
+    "inspect",
+    "list",
+    "recognise",
+    "confusion",
+    "robot",
+    "operator",
+    "link",
+    "paper",
 ];
 
 fn document(name: &str) -> String {

@@ -73,7 +73,8 @@ impl Foretold {
         let (a, b) = (self.back(n), self.back(n - 1));
         let u = t.secs_since(a.t) / b.t.secs_since(a.t);
         let e = x - a.position.lerp(&b.position, u);
-        let covariance = a.covariance * (1.0 - u) + b.covariance * u + Matrix3::identity() * LEAST_M2;
+        let covariance =
+            a.covariance * (1.0 - u) + b.covariance * u + Matrix3::identity() * LEAST_M2;
         Some(e.dot(&covariance.cholesky()?.solve(&e)))
     }
 

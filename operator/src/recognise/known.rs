@@ -90,11 +90,10 @@ impl Known {
             share += c.weight * expected / FEATURES as f64;
             total += c.weight;
         }
-        let phases =
-            Phases::new(skill, units, sd_m).map_err(|source| RecogniseError::Motion {
-                name: skill.name().to_owned(),
-                source,
-            })?;
+        let phases = Phases::new(skill, units, sd_m).map_err(|source| RecogniseError::Motion {
+            name: skill.name().to_owned(),
+            source,
+        })?;
         Ok(Self {
             mean: units.mean,
             per_scale: units.scale.map(|s| 1.0 / s),
@@ -190,12 +189,7 @@ impl Part {
 /// the component as it was.
 ///
 /// The regression is conditioned on the blurred features: `B′ = (C+P)⁻¹CB; V′ = V + BᵀCB − B′ᵀCB`.
-fn part(
-    c: &Regression,
-    knot: usize,
-    place: &Features,
-    log_units: f64,
-) -> Option<(Part, f64)> {
+fn part(c: &Regression, knot: usize, place: &Features, log_units: f64) -> Option<(Part, f64)> {
     let covariance = c.factor * c.factor.transpose();
     let blurred = covariance + Square::from_diagonal(place);
     let cholesky = blurred.cholesky()?;
@@ -210,10 +204,15 @@ fn part(
     let gain = cholesky.solve(&both).transpose();
     let [xx, xy, xz, yy, yz, zz] = c.residual[knot];
     let lost = b.transpose() * both - gain * both;
-    let residual = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz) + (lost + lost.transpose()) * 0.5;
+    let residual =
+        Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz) + (lost + lost.transpose()) * 0.5;
     let usable = log_scale.is_finite()
         && expected > 0.0
-        && whiten.iter().chain(gain.iter()).chain(residual.iter()).all(|v| v.is_finite());
+        && whiten
+            .iter()
+            .chain(gain.iter())
+            .chain(residual.iter())
+            .all(|v| v.is_finite());
     usable.then_some((
         Part {
             mean: c.mean,

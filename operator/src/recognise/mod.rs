@@ -43,6 +43,9 @@ const NOVELTY_TAU_S: f64 = 0.3;
 /// A hand this near to all its memories rests, m: below it a sensor's noise is all there is to see.
 const REST_M: f64 = 0.02;
 
+/// The share of belief at which a skill is named.
+const DECIDED: f64 = 0.5;
+
 /// How sharply `none` sets in around the threshold.
 const SHARPNESS: i32 = 8;
 
@@ -116,6 +119,8 @@ pub enum Verdict {
     Resting,
     /// It moves, but as none of the known skills.
     Unknown,
+    /// It moves as several of the known skills begin, and none has half of the belief yet.
+    Undecided,
     /// It performs the skill of this index.
     Skill(usize),
 }
@@ -297,6 +302,8 @@ impl Recogniser {
                 Verdict::Resting
             } else if novelty > self.options.reject_above {
                 Verdict::Unknown
+            } else if self.belief[i] < DECIDED {
+                Verdict::Undecided
             } else {
                 Verdict::Skill(i)
             },

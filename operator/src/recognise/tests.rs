@@ -196,7 +196,10 @@ fn a_faster_sensor_sees_the_same() {
     let mut r = recogniser(RecogniseOptions::default());
     let slow = watch(&mut r, &demonstration("wipe", 50));
     let samples = perform("wipe", 50, 120.0).1;
-    let fast = watch(&mut r, &Demonstration::from_samples("fast", &samples).unwrap());
+    let fast = watch(
+        &mut r,
+        &Demonstration::from_samples("fast", &samples).unwrap(),
+    );
     for second in [1.2, 1.6, 2.0] {
         let (a, b) = (
             slow[(30.0 * second) as usize],
@@ -250,9 +253,27 @@ fn impossible_options_and_two_of_a_name_are_refused() {
     };
     let good = RecogniseOptions::default();
     let bad = [
-        ("place_sd_m", RecogniseOptions { place_sd_m: f64::NAN, ..good }),
-        ("reject_above", RecogniseOptions { reject_above: 0.0, ..good }),
-        ("temper", RecogniseOptions { temper: 1.5, ..good }),
+        (
+            "place_sd_m",
+            RecogniseOptions {
+                place_sd_m: f64::NAN,
+                ..good
+            },
+        ),
+        (
+            "reject_above",
+            RecogniseOptions {
+                reject_above: 0.0,
+                ..good
+            },
+        ),
+        (
+            "temper",
+            RecogniseOptions {
+                temper: 1.5,
+                ..good
+            },
+        ),
         ("leak", RecogniseOptions { leak: 1.0, ..good }),
     ];
     for (field, options) in bad {
@@ -290,7 +311,10 @@ fn a_trial_counts_what_it_saw_and_repeats_itself() {
     let strangers: Vec<_> = (0..3).map(|seed| demonstration("chop", seed)).collect();
     let options = trial_options(Split::Demonstrations { folds: 2 });
     let report = trial::run(&sets, &strangers, &options, |_, _| ()).unwrap();
-    assert_eq!((report.rounds, report.judged, report.not_judged), (2, 12, 0));
+    assert_eq!(
+        (report.rounds, report.judged, report.not_judged),
+        (2, 12, 0)
+    );
     for (i, skill) in report.skills.iter().enumerate() {
         let all: usize = skill.taken_for.iter().sum::<usize>() + skill.refused;
         assert_eq!(all, 4, "{skill:?}");
@@ -300,7 +324,10 @@ fn a_trial_counts_what_it_saw_and_repeats_itself() {
     }
     assert!(report.refused_left_out[0].1.unwrap() >= 0.75, "{report:?}");
     assert!(report.refused_strangers[0].1.unwrap() >= 0.75, "{report:?}");
-    let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let one_thread = rayon::ThreadPoolBuilder::new()
+        .num_threads(1)
+        .build()
+        .unwrap();
     let again = one_thread.install(|| trial::run(&sets, &strangers, &options, |_, _| ()));
     assert_eq!(again, Ok(report));
 }

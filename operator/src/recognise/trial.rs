@@ -10,7 +10,7 @@ mod score;
 use rayon::prelude::*;
 use telemime_protocol::skill::Skill;
 
-use super::{Recogniser, RecogniseError, RecogniseOptions, Verdict};
+use super::{RecogniseError, RecogniseOptions, Recogniser, Verdict};
 use crate::demonstration::{Demonstration, Demonstrations};
 use crate::learn::align::align;
 use crate::learn::predictor::states;
@@ -63,8 +63,10 @@ pub enum TrialError {
         found: usize,
     },
     /// Nothing can be held out in this way.
-    #[error("{name}: all demonstrations are by one person ({person:?}), as the file names have it (gesture_person_trial): \
-         hold out demonstrations instead")]
+    #[error(
+        "{name}: all demonstrations are by one person ({person:?}), as the file names have it (gesture_person_trial): \
+         hold out demonstrations instead"
+    )]
     Persons {
         /// The skill.
         name: String,
@@ -72,8 +74,10 @@ pub enum TrialError {
         person: String,
     },
     /// No person performs two skills, each at least twice.
-    #[error("no person, as the file names have it (gesture_person_trial), performs two skills twice each: \
-         hold out demonstrations instead")]
+    #[error(
+        "no person, as the file names have it (gesture_person_trial), performs two skills twice each: \
+         hold out demonstrations instead"
+    )]
     NobodysOwn,
     /// A moment to ask is not a time.
     #[error("asked {at_s} s after the onset: 0 s or more is possible")]
@@ -99,8 +103,10 @@ pub enum TrialError {
 pub(crate) struct Moment {
     /// The best skill, by its index in the trial.
     best: Option<usize>,
-    /// Whether that skill was the verdict.
-    accepted: bool,
+    /// Whether a skill was named.
+    named: bool,
+    /// Whether none could be, for want of a favourite.
+    undecided: bool,
     novelty: f64,
 }
 
@@ -115,7 +121,7 @@ pub(crate) struct Attempt {
     moments: Vec<Option<Moment>>,
     /// Samples after the onset in which the hand moved, and those of them taken for a known skill.
     moving: usize,
-    accepted: usize,
+    named: usize,
     /// Σ|phase − truth| and the samples that went into it.
     phase: (f64, usize),
 }
@@ -169,7 +175,13 @@ pub fn run(
         })
         .collect::<Result<Vec<_>, _>>()?;
     let attempts: Vec<Attempt> = attempts.into_iter().flatten().collect();
-    Ok(score::report(sets, strangers.len(), &asked_s, of, &attempts))
+    Ok(score::report(
+        sets,
+        strangers.len(),
+        &asked_s,
+        of,
+        &attempts,
+    ))
 }
 
 impl Performances<'_> {
@@ -183,7 +195,10 @@ impl Performances<'_> {
         let mut taught: Vec<(usize, Skill)> = Vec::new();
         for (skill, train) in &round.train {
             let set = &self.sets[*skill];
-            let some: Vec<_> = train.iter().map(|&d| set.demonstrations[d].clone()).collect();
+            let some: Vec<_> = train
+                .iter()
+                .map(|&d| set.demonstrations[d].clone())
+                .collect();
             let learned = learn_skill(&set.name, &some, &options.learn, |_| ());
             let learned = learned.map_err(|source| TrialError::Learn {
                 name: set.name.clone(),
@@ -241,7 +256,7 @@ impl Audience {
             known,
             moments: vec![None; asked_s.len()],
             moving: 0,
-            accepted: 0,
+            named: 0,
             phase: (0.0, 0),
         };
         let away = |i: usize, from: usize| (samples[i].position - samples[from].position).norm();
@@ -249,7 +264,9 @@ impl Audience {
         let Some(onset) = (0..=last).find(|&i| away(i, 0) > ONSET_M) else {
             return attempt;
         };
-        let end = (0..=last).rfind(|&i| away(i, last) > ONSET_M).unwrap_or(last);
+        let end = (0..=last)
+            .rfind(|&i| away(i, last) > ONSET_M)
+            .unwrap_or(last);
         self.recogniser.reset();
         for (i, state) in states(d).enumerate() {
             let Some(r) = self.recogniser.take(&state) else {
@@ -259,21 +276,22 @@ impl Audience {
                 continue;
             }
             let best = r.best.map(|b| self.skills[b]);
-            let accepted = matches!(r.verdict, Verdict::Skill(_));
+            let named = matches!(r.verdict, Verdict::Skill(_));
             let since_s = samples[i].t_s - samples[onset].t_s;
             for (moment, at_s) in attempt.moments.iter_mut().zip(asked_s) {
                 // Rounding of the recording's times must not cost a frame.
                 if moment.is_none() && since_s >= at_s - 1e-6 {
                     *moment = Some(Moment {
                         best,
-                        accepted,
+                        named,
+                        undecided: r.verdict == Verdict::Undecided,
                         novelty: r.novelty,
                     });
                 }
             }
             if r.verdict != Verdict::Resting {
                 attempt.moving += 1;
-                attempt.accepted += usize::from(accepted);
+                attempt.named += usize::from(named);
             }
             if let Some((skill, phases)) = truth
                 && best == Some(skill)

@@ -23,16 +23,14 @@ pub struct Report {
     pub not_judged: usize,
     /// Share of gestures whose best skill is right, at each moment asked, by (s, share).
     pub best_right: Vec<(f64, Option<f64>)>,
-    /// Share of gestures recognised as what they are (right and not refused), at each moment asked.
+    /// Share of gestures for which their own skill was named, at each moment asked.
     pub recognised: Vec<(f64, Option<f64>)>,
-    /// Share of known gestures refused, at each moment asked.
+    /// Share of known gestures for which no skill was named, at each moment asked.
     pub refused_known: Vec<(f64, Option<f64>)>,
-    /// Share of gestures refused by those who do not know them, at each moment asked.
+    /// Share of gestures for which those who do not know them named no skill, at each moment asked.
     pub refused_left_out: Vec<(f64, Option<f64>)>,
-    /// Share of strangers refused, at each moment asked.
+    /// Share of strangers for which no skill was named, at each moment asked.
     pub refused_strangers: Vec<(f64, Option<f64>)>,
-    /// Share of gestures left out and strangers together refused, at each moment asked.
-    pub refused_unknown: Vec<(f64, Option<f64>)>,
     /// Recordings of strangers.
     pub strangers: usize,
     /// Share of the samples of strangers that were taken for a known skill, of those in which the hand moved.
@@ -52,9 +50,9 @@ pub struct SkillReport {
     pub demonstrations: usize,
     /// How many of its gestures were recognised as each skill, at `at_s`.
     pub taken_for: Vec<usize>,
-    /// How many were refused.
+    /// For how many none was named.
     pub refused: usize,
-    /// Share of its gestures refused by those who do not know it.
+    /// Share of its gestures for which those who do not know it named no skill.
     pub refused_left_out: Option<f64>,
     /// Mean |phase − true phase| where it is the best skill.
     pub phase_error: Option<f64>,
@@ -65,10 +63,12 @@ pub struct SkillReport {
 pub struct Operating {
     /// The novelty above which nothing known is seen.
     pub reject_above: f64,
-    /// Share of known gestures it refuses.
+    /// Share of known gestures for which no skill would be named.
     pub refused_known: f64,
-    /// Share of gestures left out and strangers it refuses.
-    pub refused_unknown: Option<f64>,
+    /// Share of gestures left out of learning for which none would be named.
+    pub refused_left_out: Option<f64>,
+    /// Share of strangers for which none would be named.
+    pub refused_strangers: Option<f64>,
 }
 
 fn share(part: usize, of: usize) -> Option<f64> {
@@ -107,7 +107,7 @@ pub(super) fn report(
     let left_out = || attempts.iter().filter(|a| !a.known && a.truth.is_some());
     let strange = || attempts.iter().filter(|a| a.truth.is_none());
     let right = |a: &Attempt, m: &Moment| m.best == a.truth;
-    let refused = |_: &Attempt, m: &Moment| !m.accepted;
+    let refused = |_: &Attempt, m: &Moment| !m.named;
     let each = |rate: &dyn Fn(usize) -> Option<f64>| {
         let moments = asked_s.iter().enumerate();
         moments.map(|(n, at_s)| (*at_s, rate(n))).collect()
@@ -118,7 +118,7 @@ pub(super) fn report(
         let mut refused_own = 0;
         for m in own().filter_map(|a| a.moments.first()?.as_ref()) {
             match m.best {
-                Some(best) if m.accepted => taken_for[best] += 1,
+                Some(best) if m.named => taken_for[best] += 1,
                 _ => refused_own += 1,
             }
         }
@@ -132,8 +132,7 @@ pub(super) fn report(
         }
     };
     let judged = known().filter(|a| a.moments[0].is_some()).count();
-    let (moving, accepted) =
-        strange().fold((0, 0), |(m, k), a| (m + a.moving, k + a.accepted));
+    let (moving, accepted) = strange().fold((0, 0), |(m, k), a| (m + a.moving, k + a.named));
     Report {
         rounds,
         at_s: asked_s[0],
@@ -141,11 +140,10 @@ pub(super) fn report(
         judged,
         not_judged: known().count() - judged,
         best_right: each(&|n| rate(known(), n, right)),
-        recognised: each(&|n| rate(known(), n, |a, m| right(a, m) && m.accepted)),
+        recognised: each(&|n| rate(known(), n, |a, m| right(a, m) && m.named)),
         refused_known: each(&|n| rate(known(), n, refused)),
         refused_left_out: each(&|n| rate(left_out(), n, refused)),
         refused_strangers: each(&|n| rate(strange(), n, refused)),
-        refused_unknown: each(&|n| rate(attempts.iter().filter(|a| !a.known), n, refused)),
         strangers,
         strangers_time_accepted: share(accepted, moving),
         roc: roc(attempts),
@@ -155,34 +153,36 @@ pub(super) fn report(
 
 /// For each share of known gestures refused the lowest threshold that refuses no more of them.
 fn roc(attempts: &[Attempt]) -> Vec<Operating> {
-    let novelties = |known: bool| {
-        let some = attempts.iter().filter(move |a| a.known == known);
-        some.filter_map(|a| Some(a.moments[0]?.novelty))
-    };
-    let mut of_known: Vec<f64> = novelties(true).collect();
-    of_known.sort_by(f64::total_cmp);
-    if of_known.is_empty() {
-        return Vec::new();
-    }
-    let n = of_known.len();
-    let above = |all: &mut dyn Iterator<Item = f64>, threshold: f64| {
-        let (mut part, mut of) = (0, 0);
-        for novelty in all {
-            of += 1;
-            part += usize::from(novelty > threshold);
+    // Who has no favourite names none at any threshold.
+    let strangeness = |m: &Moment| {
+        if m.undecided {
+            f64::INFINITY
+        } else {
+            m.novelty
         }
-        share(part, of)
     };
-    OPERATING
-        .iter()
-        .map(|wanted| {
-            let refused = (wanted * n as f64) as usize;
-            let reject_above = of_known[n - 1 - refused.min(n - 1)];
-            Operating {
-                reject_above,
-                refused_known: above(&mut novelties(true), reject_above).unwrap_or(0.0),
-                refused_unknown: above(&mut novelties(false), reject_above),
-            }
+    let known = || attempts.iter().filter(|a| a.known);
+    let mut sorted: Vec<f64> = known()
+        .filter_map(|a| a.moments[0].as_ref().map(strangeness))
+        .collect();
+    sorted.sort_by(f64::total_cmp);
+    let Some(last) = sorted.len().checked_sub(1) else {
+        return Vec::new();
+    };
+    let operating = |wanted: &f64| {
+        let refused = (wanted * sorted.len() as f64) as usize;
+        let reject_above = sorted[last - refused.min(last)];
+        let above = |_: &Attempt, m: &Moment| strangeness(m) > reject_above;
+        let unknown = |left_out: bool| {
+            let some = attempts.iter().filter(move |a| !a.known);
+            some.filter(move |a| a.truth.is_some() == left_out)
+        };
+        reject_above.is_finite().then(|| Operating {
+            reject_above,
+            refused_known: rate(known(), 0, above).unwrap_or(0.0),
+            refused_left_out: rate(unknown(true), 0, above),
+            refused_strangers: rate(unknown(false), 0, above),
         })
-        .collect()
+    };
+    OPERATING.iter().filter_map(operating).collect()
 }
