@@ -16,4 +16,5 @@ pub mod measure;
 mod paper;
 mod recognise;
 pub mod relay;
+mod select;
 mod teach;

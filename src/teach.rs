@@ -46,7 +46,14 @@ pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
     if let Ok(style) = ProgressStyle::with_template("{spinner} {msg}") {
         bar.set_style(style);
     }
+    let mut degenerate = Vec::new();
     let skill = learn_skill(&found.name, &found.demonstrations, &options, |progress| {
+        if let Progress::Motion {
+            degenerate: found, ..
+        } = &progress
+        {
+            degenerate.clone_from(found);
+        }
         bar.set_message(match progress {
             Progress::Aligned { medoid, .. } => format!("aligned to {medoid}"),
             Progress::Candidate(candidate) => format!("motion: {candidate:?}"),
@@ -57,6 +64,9 @@ pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
         bar.tick();
     })?;
     bar.finish_and_clear();
+    for what in degenerate {
+        eprintln!("note: the motion's mixture over (t, x, y, z): {what}");
+    }
     let path = args
         .output
         .clone()

@@ -1,5 +1,6 @@
 //! The operator daemon's command line: flags over a TOML file over defaults.
 
+mod infer;
 mod played;
 mod report;
 mod skills;
@@ -19,9 +20,10 @@ use tokio::sync::mpsc;
 use crate::daemon::Daemon;
 use crate::session::{FutureBound, SessionConfig};
 use crate::task::{Outcome, Recording, Task};
+pub use infer::{Bounds, infer};
 use played::Played;
-pub use report::{Event, PlayReport, Scores};
-pub use skills::{Skills, infer};
+pub use report::{Event, PlayReport, Scores, TurnScores};
+pub use skills::Skills;
 
 /// Teach, drive and play a robot.
 ///
@@ -63,6 +65,9 @@ pub struct Args {
     /// Play: largest error of the rebuilt motion, m [default: 1 % of the skill's reach].
     #[arg(long, value_name = "M")]
     pub bound: Option<f64>,
+    /// Play: the rebuilt orientation passes this near the inferred one, rad [default: 0.02].
+    #[arg(long, value_name = "RAD")]
+    pub turn_bound: Option<f64>,
     /// Tip metres per hand metre [default: from the demonstrations and the arm's limits].
     #[arg(long)]
     pub scale: Option<f64>,
@@ -175,6 +180,7 @@ struct File {
     replay: Option<PathBuf>,
     play: Option<String>,
     bound_m: Option<f64>,
+    turn_bound_rad: Option<f64>,
     scale: Option<f64>,
     axes: Option<Axes>,
     gain: Option<f64>,
@@ -218,6 +224,7 @@ impl Args {
             (self.replay, self.play) = (file.replay, file.play);
         }
         self.bound = self.bound.or(file.bound_m);
+        self.turn_bound = self.turn_bound.or(file.turn_bound_rad);
         self.scale = self.scale.or(file.scale);
         self.axes = self.axes.or(file.axes);
         self.gain = self.gain.or(file.gain);
@@ -367,20 +374,20 @@ fn make_task(
     match (&args.replay, &args.play) {
         (Some(path), None) => {
             let recording = skills.unseen(path)?;
-            let samples = recording
-                .samples()
-                .iter()
-                .map(|s| (s.t_s, s.position))
-                .collect();
+            let samples = recording.samples().to_vec();
             let rest_s = args.rest.unwrap_or(1.0).clamp(0.0, 60.0);
             Ok((Task::replay(Recording { samples, rest_s }), None))
         }
         (None, Some(name)) => {
             let skill = skills.named(name)?;
-            let bound_m = args.bound.unwrap_or(0.01 * skill.stats().reach_m);
-            let (plan, report) = infer(&skill, bound_m)?;
+            let derived = Bounds::of(&skill);
+            let bounds = Bounds {
+                place_m: args.bound.unwrap_or(derived.place_m),
+                turn_rad: args.turn_bound.unwrap_or(derived.turn_rad),
+            };
+            let (plan, report) = infer(&skill, bounds)?;
             log.say(&Event::Plan(report));
-            let played = Played::new(plan.spline()?, skills.aligned(name), rotation);
+            let played = Played::new(plan.curve()?, skills.aligned(name), rotation);
             Ok((Task::play(plan), Some(played)))
         }
         _ => bail!("what to do? Give --replay FILE or --play SKILL"),
@@ -454,7 +461,8 @@ mod tests {
             .and_then(|rest| rest.split("```").next())
             .unwrap()
             .replace("# play", "play")
-            .replace("# bound_m", "bound_m");
+            .replace("# bound_m", "bound_m")
+            .replace("# turn_bound_rad", "turn_bound_rad");
         let file: File = toml::from_str(&example).unwrap();
         assert!(!format!("{file:?}").contains("None"), "a key is missing");
         parse_future_bound(&file.future_bound.unwrap()).unwrap();

@@ -1,4 +1,4 @@
-//! Recorded demonstrations: `t,x,y,z` CSV, one file each; a folder is a skill.
+//! Recorded demonstrations: `t,x,y,z[,qw,qx,qy,qz][,grip]` CSV, one file each; a folder is a skill.
 
 mod error;
 
@@ -27,8 +27,10 @@ mod tests;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use nalgebra::Vector3;
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use sha2::{Digest, Sha256};
+
+use telemime_protocol::pose;
 
 pub use error::{DemonstrationError, Notice};
 
@@ -45,7 +47,30 @@ pub struct Sample {
     pub t_s: f64,
     /// Position, m.
     pub position: Vector3<f64>,
+    /// Orientation, where the recording has it: from the hand's own axes to the tracker's. Of q and −q, which
+    /// are the same, the one nearer to the sample before.
+    pub orientation: Option<UnitQuaternion<f64>>,
+    /// How far the gripper is open, from 0 to 1, where the recording has it.
+    pub grip: Option<f64>,
 }
+
+impl Sample {
+    /// A position (m) at a time (s), and nothing else.
+    pub fn at(t_s: f64, position: Vector3<f64>) -> Self {
+        Self {
+            t_s,
+            position,
+            orientation: None,
+            grip: None,
+        }
+    }
+}
+
+/// The columns of a quaternion, scalar first.
+const QUATERNION: [&str; 4] = ["qw", "qx", "qy", "qz"];
+
+/// A quaternion's norm may be off by this much: it is written with a few digits.
+const NORM_SLACK: f64 = 0.01;
 
 /// One performance of a skill: at least [`LEAST_SAMPLES`] finite samples, time strictly ascending.
 #[derive(Debug, Clone, PartialEq)]
@@ -92,6 +117,18 @@ impl Demonstration {
             .collect();
         let index = |column| find_column(&path, &columns, column);
         let wanted = [index("t")?, index("x")?, index("y")?, index("z")?];
+        let named = |column: &str| columns.iter().any(|c| c == column);
+        let turn = if QUATERNION.into_iter().any(named) {
+            let [w, x, y, z] = QUATERNION;
+            Some([index(w)?, index(x)?, index(y)?, index(z)?])
+        } else {
+            None
+        };
+        let grip = if named("grip") {
+            Some(index("grip")?)
+        } else {
+            None
+        };
 
         let mut samples: Vec<Sample> = Vec::new();
         // Recordings stamped since 1970 are as good as any: only differences mean something.
@@ -103,14 +140,18 @@ impl Demonstration {
         {
             let line = record.position().map_or(0, csv::Position::line);
             let mut values = [0.0_f64; 4];
-            for ((value, &at), column) in values.iter_mut().zip(&wanted).zip(["t", "x", "y", "z"]) {
+            let number = |at: usize, column| {
                 let text = record.get(at).unwrap_or_default();
-                *value = text.parse().map_err(|_| DemonstrationError::NotANumber {
-                    path: path.clone(),
-                    line,
-                    column,
-                    text: text.to_owned(),
-                })?;
+                text.parse::<f64>()
+                    .map_err(|_| DemonstrationError::NotANumber {
+                        path: path.clone(),
+                        line,
+                        column,
+                        text: text.to_owned(),
+                    })
+            };
+            for ((value, &at), column) in values.iter_mut().zip(&wanted).zip(["t", "x", "y", "z"]) {
+                *value = number(at, column)?;
                 if column == "t" && value.is_finite() {
                     *value -= *zero_s.get_or_insert(*value);
                 }
@@ -132,9 +173,39 @@ impl Demonstration {
                     path,
                 });
             }
+            let orientation = match &turn {
+                None => None,
+                Some(at) => {
+                    let mut q = [0.0; 4];
+                    for ((q, &at), column) in q.iter_mut().zip(at).zip(QUATERNION) {
+                        *q = number(at, column)?;
+                    }
+                    let [w, i, j, k] = q;
+                    let q = Quaternion::new(w, i, j, k);
+                    let norm = q.norm();
+                    // Written so that NaN fails too.
+                    if !((norm - 1.0).abs() <= NORM_SLACK) {
+                        return Err(DemonstrationError::NotARotation { path, line, norm });
+                    }
+                    let before = samples.last().and_then(|s| s.orientation);
+                    let q = UnitQuaternion::from_quaternion(q);
+                    let away = before.is_some_and(|b| b.coords.dot(&q.coords) < 0.0);
+                    Some(if away {
+                        UnitQuaternion::new_unchecked(-q.into_inner())
+                    } else {
+                        q
+                    })
+                }
+            };
+            let grip = grip.map(|at| number(at, "grip")).transpose()?;
+            if let Some(value) = grip.filter(|grip| !(0.0..=1.0).contains(grip)) {
+                return Err(DemonstrationError::Grip { path, line, value });
+            }
             samples.push(Sample {
                 t_s,
                 position: Vector3::new(x, y, z),
+                orientation,
+                grip,
             });
         }
         if samples.is_empty() {
@@ -149,7 +220,8 @@ impl Demonstration {
         let ignored: Vec<String> = columns
             .iter()
             .enumerate()
-            .filter(|(i, _)| !wanted.contains(i))
+            .filter(|(i, _)| !wanted.contains(i) && grip != Some(*i))
+            .filter(|(i, _)| !turn.is_some_and(|turn| turn.contains(i)))
             .map(|(_, c)| c.clone())
             .collect();
         let notices = if ignored.is_empty() {
@@ -181,6 +253,16 @@ impl Demonstration {
         samples: &[Sample],
     ) -> Result<Self, DemonstrationError> {
         Self::parse(name, csv_text(samples).as_bytes())
+    }
+
+    /// Whether every sample has an orientation.
+    pub fn has_orientation(&self) -> bool {
+        self.samples.iter().all(|s| s.orientation.is_some())
+    }
+
+    /// Whether every sample says how far the gripper is open.
+    pub fn has_grip(&self) -> bool {
+        self.samples.iter().all(|s| s.grip.is_some())
     }
 
     /// Its samples as CSV; reading that back gives the same numbers.
@@ -225,16 +307,37 @@ impl Demonstration {
 
     /// The position (m) at `t_s`: linear between samples, the first and last position beyond them.
     pub fn position_at(&self, t_s: f64) -> Vector3<f64> {
+        let (a, b, u) = self.around(t_s);
+        a.position.lerp(&b.position, u)
+    }
+
+    /// The orientation at `t_s`: along the shortest rotation between samples, the first and last beyond them;
+    /// `None` if the recording has none.
+    pub fn orientation_at(&self, t_s: f64) -> Option<UnitQuaternion<f64>> {
+        let (a, b, u) = self.around(t_s);
+        let (a, b) = (a.orientation?, b.orientation?);
+        Some(pose::moved(&a, &(pose::between(&a, &b) * u)))
+    }
+
+    /// How far the gripper is open at `t_s`: linear between samples, the first and last value beyond them; `None`
+    /// if the recording does not say.
+    pub fn grip_at(&self, t_s: f64) -> Option<f64> {
+        let (a, b, u) = self.around(t_s);
+        let (a, b) = (a.grip?, b.grip?);
+        Some(a + (b - a) * u)
+    }
+
+    /// The samples before and after `t_s`, and how far it is from the one to the other, from 0 to below 1.
+    fn around(&self, t_s: f64) -> (&Sample, &Sample, f64) {
         let after = self.samples.partition_point(|s| s.t_s <= t_s);
         let Some(b) = self.samples.get(after) else {
-            return self.last().position;
+            return (self.last(), self.last(), 0.0);
         };
         if after == 0 {
-            return b.position;
+            return (b, b, 0.0);
         }
         let a = &self.samples[after - 1];
-        a.position
-            .lerp(&b.position, (t_s - a.t_s) / (b.t_s - a.t_s))
+        (a, b, (t_s - a.t_s) / (b.t_s - a.t_s))
     }
 }
 
@@ -358,11 +461,23 @@ fn csv_error(path: &Path, error: &csv::Error) -> DemonstrationError {
     }
 }
 
+/// A column that not every sample has is left out.
 fn csv_text(samples: &[Sample]) -> String {
-    let mut text = String::from("t,x,y,z\n");
+    let mut text = String::from("t,x,y,z");
+    let turns = samples.iter().all(|s| s.orientation.is_some());
+    let grips = samples.iter().all(|s| s.grip.is_some());
+    text += if turns { ",qw,qx,qy,qz" } else { "" };
+    text += if grips { ",grip\n" } else { "\n" };
     for s in samples {
         let p = &s.position;
-        text += &format!("{},{},{},{}\n", s.t_s, p.x, p.y, p.z);
+        text += &format!("{},{},{},{}", s.t_s, p.x, p.y, p.z);
+        if let Some(q) = s.orientation.filter(|_| turns) {
+            text += &format!(",{},{},{},{}", q.w, q.i, q.j, q.k);
+        }
+        if let Some(grip) = s.grip.filter(|_| grips) {
+            text += &format!(",{grip}");
+        }
+        text += "\n";
     }
     text
 }

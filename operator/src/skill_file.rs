@@ -80,9 +80,11 @@ mod tests {
     #[test]
     fn a_skill_survives_the_disk_and_faults_name_the_file() {
         let samples: Vec<_> = (0..30)
-            .map(|i| Sample {
-                t_s: f64::from(i) / 30.0,
-                position: Vector3::new(f64::from(i) * 0.01, 0.0, 0.0),
+            .map(|i| {
+                Sample::at(
+                    f64::from(i) / 30.0,
+                    Vector3::new(f64::from(i) * 0.01, 0.0, 0.0),
+                )
             })
             .collect();
         let demo = Demonstration::from_samples("line", &samples).unwrap();

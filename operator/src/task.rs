@@ -1,10 +1,10 @@
 //! What the operator is to do: replay a recording as if the hand were there, or play a skill.
 
-use nalgebra::Vector3;
-use telemime_protocol::checkpoint::Plan;
+use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, Refusal, RobotState};
 
+use crate::demonstration::Sample;
 use crate::session::{Event, HandSample, Session};
 
 /// Pause before a declined request is made again, s.
@@ -37,15 +37,15 @@ pub enum Advice {
 /// A recording with its own time, s from 0.
 #[derive(Debug, Clone)]
 pub struct Recording {
-    /// Time (s) and position (m), in order.
-    pub samples: Vec<(f64, Vector3<f64>)>,
+    /// The hand, in order of time.
+    pub samples: Vec<Sample>,
     /// The hand rests at the first position for this long before the recording begins, s: one engages at rest.
     pub rest_s: f64,
 }
 
 enum Work {
     Replay { recording: Recording, next: usize },
-    Play { plan: Plan<3> },
+    Play { plan: PosePlan },
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -77,8 +77,8 @@ impl Task {
     }
 
     /// Plays `plan`.
-    pub fn play(plan: Plan<3>) -> Self {
-        Self::new(Work::Play { plan })
+    pub fn play(plan: impl Into<PosePlan>) -> Self {
+        Self::new(Work::Play { plan: plan.into() })
     }
 
     fn new(work: Work) -> Self {
@@ -115,7 +115,7 @@ impl Task {
         self.phase == Phase::Over
             || match &self.work {
                 Work::Replay { recording, .. } => {
-                    let end_s = recording.samples.last().map_or(0.0, |s| s.0);
+                    let end_s = recording.samples.last().map_or(0.0, |s| s.t_s);
                     self.zero()
                         .is_some_and(|zero| now.secs_since(zero) > end_s + LEAVE_S)
                 }
@@ -285,18 +285,19 @@ fn rest_samples(recording: &Recording) -> usize {
 fn sample_at(recording: &Recording, i: usize, started: Stamp) -> Option<HandSample> {
     let resting = rest_samples(recording);
     let first = recording.samples.first()?;
-    if i < resting {
-        return Some(HandSample {
-            t: started.offset_by_secs(i as f64 * REST_INTERVAL_S),
-            x: first.1,
-            resting: true,
-        });
-    }
-    let (t_s, x) = recording.samples.get(i - resting)?;
+    let (sample, t) = if i < resting {
+        (first, started.offset_by_secs(i as f64 * REST_INTERVAL_S))
+    } else {
+        let sample = recording.samples.get(i - resting)?;
+        let since_s = recording.rest_s + sample.t_s - first.t_s;
+        (sample, started.offset_by_secs(since_s))
+    };
     Some(HandSample {
-        t: started.offset_by_secs(recording.rest_s + t_s - first.0),
-        x: *x,
-        resting: false,
+        t,
+        x: sample.position,
+        orientation: sample.orientation,
+        grip: sample.grip,
+        resting: i < resting,
     })
 }
 

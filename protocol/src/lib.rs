@@ -5,6 +5,7 @@
 //! This crate has no clock, no I/O and no platform-dependent mathematics, and a query never allocates.
 
 pub mod checkpoint;
+pub mod pose;
 pub mod predict;
 pub mod skill;
 pub mod spline;

@@ -2,6 +2,7 @@
 
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::state::WireState;
+use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::*;
 
 const STATE: WireState = WireState {
@@ -15,6 +16,16 @@ const PARAMS: WireParams = WireParams {
     gain: 255,
     trust: 200,
     cv_damping: 128,
+};
+
+const POSE: WirePose = WirePose {
+    turn: Some(WireTurn {
+        q: WireRotation([10_000, -31_416, 0]),
+        memory_exponent: 4,
+        memory: [[1, 2, 3], [-1, -2, -3], [127, -128, 0], [5, 6, 7]],
+        params: PARAMS,
+    }),
+    grip: Some(100),
 };
 
 const ID: ModelId = [
@@ -51,10 +62,11 @@ fn operator_control() {
             lease_ms: 650,
         })
     };
-    let mirror = Drive::Mirror {
+    let mirror = |pose| Drive::Mirror {
         state: STATE,
         model: 0x3210,
         params: PARAMS,
+        pose,
     };
     pinned(vec![
         (
@@ -72,9 +84,15 @@ fn operator_control() {
             "01fb2c01020102",
         ),
         (
-            engage(mirror),
-            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ffc8800000003e \
-             0000003f000000bf0000003f0000003ffb204efb8a02",
+            engage(mirror(WirePose::default())),
+            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ffc8800000 \
+             0000003e0000003f000000bf0000003f0000003ffb204efb8a02",
+        ),
+        (
+            engage(mirror(POSE)),
+            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ffc880 \
+             01fb204efb6ff50004010203fffefd7f8000050607ffc8800164 \
+             0000003e0000003f000000bf0000003f0000003ffb204efb8a02",
         ),
         (
             engage(Drive::Play { plan: 300 }),
@@ -135,8 +153,21 @@ fn robot_control() {
                 t_us: -1,
                 hand_m: [0.5, -0.25, 2.5],
                 tip_m: [0.5, 0.0, 0.5],
+                hand_q: None,
+                tip_q: WireRotation([0, 1, -1]),
             },
-            "0303010000003f000080be000020400000003f000000000000003f",
+            "0303010000003f000080be000020400000003f000000000000003f00000201",
+        ),
+        (
+            RobotControl::Engaged {
+                engagement: 3,
+                t_us: -1,
+                hand_m: [0.5, -0.25, 2.5],
+                tip_m: [0.5, 0.0, 0.5],
+                hand_q: Some(WireRotation([31_416, -31_416, 125])),
+                tip_q: WireRotation([0, 1, -1]),
+            },
+            "0303010000003f000080be000020400000003f000000000000003f01fb70f5fb6ff5fa000201",
         ),
         (
             RobotControl::Refused {
@@ -157,7 +188,7 @@ fn robot_control() {
 
 #[test]
 fn operator_datagrams() {
-    let motion = |checksum, knots| {
+    let motion = |checksum, pose, knots| {
         OperatorDatagram::Motion(Motion {
             epoch: 1,
             engagement: 3,
@@ -167,6 +198,7 @@ fn operator_datagrams() {
             params: PARAMS,
             checksum,
             state: STATE,
+            pose,
             first_knot: 250,
             knots,
         })
@@ -185,14 +217,19 @@ fn operator_datagrams() {
     ];
     pinned(vec![
         (
-            motion(Some(0xdead_beef), knots),
+            motion(Some(0xdead_beef), WirePose::default(), knots),
             "000103fc70110100fb8a02fb1032ffc88001fcefbeaddefc0ead2500fbd007fb8713fb50c30301ff \
-             02fe03fd28ce3c7f8000fa02010001027f8000fbc819fcfefffffffcfffffffffbfc00fbfb00faf9",
+             02fe03fd28ce3c7f80000000fa02010001027f8000fbc819fcfefffffffcfffffffffbfc00fbfb00faf9",
         ),
         (
-            motion(None, vec![]),
+            motion(None, WirePose::default(), vec![]),
             "000103fc70110100fb8a02fb1032ffc88000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
-             ce3c7f8000fa00",
+             ce3c7f80000000fa00",
+        ),
+        (
+            motion(None, POSE, vec![]),
+            "000103fc70110100fb8a02fb1032ffc88000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
+             ce3c7f800001fb204efb6ff50004010203fffefd7f8000050607ffc8800164fa00",
         ),
         (
             OperatorDatagram::Go {
@@ -237,6 +274,8 @@ fn robot_datagrams() {
         tick_p99_ns: 70_000,
         overruns: 6,
         tip_m: [0.5, 0.0, -0.5],
+        tip_q: WireRotation([125, -126, 0]),
+        grip: Some(255),
         q: vec![1.0, -2.0],
     };
     pinned(vec![
@@ -250,7 +289,7 @@ fn robot_datagrams() {
         (
             RobotDatagram::Telemetry(telemetry),
             "0101020203fc0ead2500fb50c36e69fafbfb00fbfc000405fb7017fc70110100060000003f000000 \
-             00000000bf020000803f000000c0",
+             00000000bffafbfb000001ff020000803f000000c0",
         ),
     ]);
 }

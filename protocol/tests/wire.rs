@@ -11,6 +11,7 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::state::{MAX_POSITION_M, POSITION_STEP_M, WireState};
+use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::*;
 
 fn finite() -> impl Strategy<Value = f32> {
@@ -46,6 +47,27 @@ fn params() -> impl Strategy<Value = WireParams> {
     })
 }
 
+fn rotation() -> impl Strategy<Value = WireRotation> {
+    [
+        -31_416..=31_416_i16,
+        -31_416..=31_416_i16,
+        -31_416..=31_416_i16,
+    ]
+    .prop_map(WireRotation)
+}
+
+fn pose() -> impl Strategy<Value = WirePose> {
+    let turn = (rotation(), 0..=10u8, any::<[[i8; 3]; 4]>(), params()).prop_map(
+        |(q, memory_exponent, memory, params)| WireTurn {
+            q,
+            memory_exponent,
+            memory,
+            params,
+        },
+    );
+    (option::of(turn), option::of(any::<u8>())).prop_map(|(turn, grip)| WirePose { turn, grip })
+}
+
 fn unit() -> impl Strategy<Value = [f32; 4]> {
     let quaternion = [-1.0..1.0f32, -1.0..1.0f32, -1.0..1.0f32, 0.1..1.0f32];
     quaternion.prop_map(|q| {
@@ -56,10 +78,13 @@ fn unit() -> impl Strategy<Value = [f32; 4]> {
 
 fn engage() -> impl Strategy<Value = Engage> {
     let drive = prop_oneof![
-        (state(), any::<u16>(), params()).prop_map(|(state, model, params)| Drive::Mirror {
-            state,
-            model,
-            params
+        (state(), any::<u16>(), params(), pose()).prop_map(|(state, model, params, pose)| {
+            Drive::Mirror {
+                state,
+                model,
+                params,
+                pose,
+            }
         }),
         any::<u32>().prop_map(|plan| Drive::Play { plan }),
     ];
@@ -177,14 +202,24 @@ fn robot_control() -> impl Strategy<Value = RobotControl> {
         info,
         any::<[u8; 16]>().prop_map(|id| RobotControl::ModelStored { id }),
         any::<u32>().prop_map(|id| RobotControl::PlanStored { id }),
-        (any::<u32>(), any::<i64>(), three(), three()).prop_map(
-            |(engagement, t_us, hand_m, tip_m)| RobotControl::Engaged {
-                engagement,
-                t_us,
-                hand_m,
-                tip_m
-            }
-        ),
+        (
+            any::<u32>(),
+            any::<i64>(),
+            three(),
+            three(),
+            option::of(rotation()),
+            rotation()
+        )
+            .prop_map(|(engagement, t_us, hand_m, tip_m, hand_q, tip_q)| {
+                RobotControl::Engaged {
+                    engagement,
+                    t_us,
+                    hand_m,
+                    tip_m,
+                    hand_q,
+                    tip_q,
+                }
+            }),
         refusal().prop_map(|reason| RobotControl::Refused { reason }),
         (robot_state(), cause(), any::<u32>()).prop_map(|(state, cause, changes)| {
             RobotControl::State {
@@ -197,7 +232,7 @@ fn robot_control() -> impl Strategy<Value = RobotControl> {
 }
 
 /// As many knots as fit whatever they are; of small ones [`MAX_KNOTS`] do.
-const FITTING_KNOTS: usize = 28;
+const FITTING_KNOTS: usize = 27;
 
 fn knot() -> impl Strategy<Value = WireKnot> {
     (any::<u32>(), any::<[i32; 3]>(), any::<[i32; 3]>()).prop_map(|(dt, dx, v)| WireKnot {
@@ -213,7 +248,7 @@ fn motion() -> impl Strategy<Value = Motion> {
         any::<[u16; 2]>(),
         params(),
         option::of(any::<u32>()),
-        state(),
+        (state(), pose()),
         vec(knot(), 0..=FITTING_KNOTS),
     )
         .prop_map(
@@ -222,7 +257,7 @@ fn motion() -> impl Strategy<Value = Motion> {
                 [lease_ms, model],
                 params,
                 checksum,
-                state,
+                (state, pose),
                 knots,
             )| {
                 Motion {
@@ -234,6 +269,7 @@ fn motion() -> impl Strategy<Value = Motion> {
                     params,
                     checksum,
                     state,
+                    pose,
                     first_knot,
                     knots,
                 }
@@ -272,30 +308,35 @@ fn robot_datagram() -> impl Strategy<Value = RobotDatagram> {
         any::<i64>(),
         robot_state(),
         [finite(), finite(), finite()],
+        (rotation(), option::of(any::<u8>())),
         vec(finite(), 0..=MAX_JOINTS),
     )
-        .prop_map(|(n, [age_ms, delay_ms], t_us, state, tip_m, q)| {
-            RobotDatagram::Telemetry(Telemetry {
-                epoch: n[0],
-                seq: n[1],
-                state,
-                engagement: n[2],
-                t_us,
-                clock_uncertainty_us: n[3],
-                age_ms,
-                delay_ms,
-                path_frontier: n[4],
-                received: n[5],
-                newest_seq: n[6],
-                dropped: n[7],
-                clamps: n[8],
-                tick_mean_ns: n[9],
-                tick_p99_ns: n[10],
-                overruns: n[11],
-                tip_m,
-                q,
-            })
-        });
+        .prop_map(
+            |(n, [age_ms, delay_ms], t_us, state, tip_m, (tip_q, grip), q)| {
+                RobotDatagram::Telemetry(Telemetry {
+                    epoch: n[0],
+                    seq: n[1],
+                    state,
+                    engagement: n[2],
+                    t_us,
+                    clock_uncertainty_us: n[3],
+                    age_ms,
+                    delay_ms,
+                    path_frontier: n[4],
+                    received: n[5],
+                    newest_seq: n[6],
+                    dropped: n[7],
+                    clamps: n[8],
+                    tick_mean_ns: n[9],
+                    tick_p99_ns: n[10],
+                    overruns: n[11],
+                    tip_m,
+                    tip_q,
+                    grip,
+                    q,
+                })
+            },
+        );
     prop_oneof![
         (any::<u32>(), any::<i64>())
             .prop_map(|(epoch, t1_us)| RobotDatagram::Ping { epoch, t1_us }),
@@ -481,6 +522,7 @@ fn counts_beyond_their_limits_are_refused() {
             params: WireParams::quantise(&Params::DEFAULT),
             checksum: None,
             state: WireState::quantise(&state).expect("within range"),
+            pose: WirePose::default(),
             first_knot: 0,
             knots: vec![knot; knots],
         })

@@ -4,7 +4,9 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use telemime_protocol::wire::v1::{Info, RobotState};
-use telemime_sim::arm::{ArmError, ArmModel, Joints, LoadOptions, Plant, PlantError, default_urdf};
+use telemime_sim::arm::{
+    ArmError, ArmModel, Gripper, Joints, LoadOptions, Plant, PlantError, default_urdf,
+};
 
 use crate::control::{ControlConfig, ControlError, Controller, home_posture, workspace_radius};
 use crate::safety::SafetyConfig;
@@ -192,6 +194,7 @@ impl Rig {
             self.config,
             self.controller.clone(),
             self.plant.clone(),
+            Gripper::default(),
             rings,
         )
     }

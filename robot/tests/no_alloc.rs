@@ -7,9 +7,10 @@
 use std::collections::BTreeSet;
 
 use allocation_counter::measure;
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::{UnitQuaternion, Vector1, Vector3, Vector4};
 use telemime_endpoint::Mono;
-use telemime_protocol::predict::{Forecast, HandState, Params};
+use telemime_protocol::checkpoint::PoseCurve;
+use telemime_protocol::predict::{Forecast, HandState, Params, TurnForecast, TurnState};
 use telemime_protocol::skill::example;
 use telemime_protocol::spline::{BSpline, End};
 use telemime_protocol::time::Stamp;
@@ -89,6 +90,17 @@ impl Bench {
         }));
     }
 
+    /// The hand held turned by `angle` about an axis.
+    fn turn(&self, angle: f64) -> TurnForecast {
+        let q = UnitQuaternion::from_scaled_axis(Vector3::new(0.6, 0.0, 0.8) * angle);
+        let mut state = TurnState::first(Stamp::ZERO, q);
+        state.advance(
+            Stamp::from_secs_f64(0.03),
+            UnitQuaternion::from_scaled_axis(Vector3::new(0.1, 0.0, -0.2)) * q,
+        );
+        TurnForecast::constant_velocity(&state, &Params::DEFAULT)
+    }
+
     /// What the hand's newest sample, valid now, predicts.
     fn forecast(&self, with_model: bool) -> Forecast {
         let t_s = self.now.0 as f64 * 1e-9;
@@ -114,8 +126,17 @@ fn trajectory(duration_s: f64) -> Source {
         .iter()
         .map(|t| Vector3::new(t.sin(), 0.2 * t, 0.0))
         .collect();
+    let q: Vec<_> = t
+        .iter()
+        .map(|t| Vector4::new(1.0, 0.2 * t, 0.0, -0.1 * t))
+        .collect();
+    let grip: Vec<_> = t.iter().map(|t| Vector1::new(t / duration_s)).collect();
     Source::Play(Box::new(Trajectory {
-        spline: BSpline::interpolate(&t, &x, End::Natural).unwrap(),
+        curve: PoseCurve {
+            position: BSpline::interpolate(&t, &x, End::Natural).unwrap(),
+            orientation: Some(BSpline::interpolate(&t, &q, End::Natural).unwrap()),
+            grip: Some(BSpline::interpolate(&t, &grip, End::Natural).unwrap()),
+        },
         duration_s,
     }))
 }
@@ -134,15 +155,31 @@ fn a_tick_never_touches_the_heap() {
     bench.tick(5);
 
     let (forecast, valid_at) = (bench.forecast(false), bench.now);
-    bench.engage(1, Source::Mirror { forecast, valid_at });
+    bench.engage(
+        1,
+        Source::Mirror {
+            forecast,
+            valid_at,
+            turn: Some(bench.turn(0.0)),
+            grip: Some(0.0),
+        },
+    );
     for i in 0..60 {
         bench.tick(33);
         let (forecast, valid_at) = (bench.forecast(i % 2 == 0), bench.now);
+        // Slowly, by leaps, from one sign to the other, and not at all.
+        let turn = match i % 20 {
+            0..15 => bench.turn(0.02 * f64::from(i)),
+            15..18 => bench.turn(3.0 * f64::from(i)),
+            _ => bench.turn(f64::NAN),
+        };
         let lease = bench.lease();
         bench.order(Order::Track {
             ticket: ticket(1),
             forecast,
             valid_at,
+            turn: (i % 5 > 0).then_some(turn),
+            grip: (i % 3 > 0).then_some(0.1 * f64::from(i % 10)),
             lease,
         });
     }
@@ -173,7 +210,15 @@ fn a_tick_never_touches_the_heap() {
     assert_eq!(bench.tick(700).state, RobotState::Holding);
 
     let (forecast, valid_at) = (bench.forecast(true), bench.now);
-    bench.engage(5, Source::Mirror { forecast, valid_at });
+    bench.engage(
+        5,
+        Source::Mirror {
+            forecast,
+            valid_at,
+            turn: None,
+            grip: None,
+        },
+    );
     bench.tick(300);
     bench.order(Order::Release(ticket(5)));
     bench.tick(500);

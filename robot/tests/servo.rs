@@ -69,7 +69,12 @@ impl Bench {
         let forecast = forecast();
         self.order(Order::Engage(Engagement {
             ticket: ticket(number),
-            source: Source::Mirror { forecast, valid_at },
+            source: Source::Mirror {
+                forecast,
+                valid_at,
+                turn: None,
+                grip: None,
+            },
             scale,
             rotation: UnitQuaternion::identity(),
             lease,
@@ -82,6 +87,8 @@ impl Bench {
             ticket: ticket(number),
             forecast: forecast(),
             valid_at,
+            turn: None,
+            grip: None,
             lease,
         });
     }
@@ -205,6 +212,8 @@ fn engaging_again_and_again_does_not_walk_out_of_the_workspace() {
                     ticket: ticket(number),
                     forecast: Forecast::constant_velocity(&hand, &Params::DEFAULT),
                     valid_at,
+                    turn: None,
+                    grip: None,
                     lease,
                 });
             } else {

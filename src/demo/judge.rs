@@ -151,6 +151,8 @@ pub(super) fn engagement(run: &Run) -> anyhow::Result<(Mapping, i64)> {
                     rotation,
                     hand_m,
                     tip_m,
+                    hand_orientation: None,
+                    tip_orientation: UnitQuaternion::identity(),
                 },
                 *mono_ns,
             ))

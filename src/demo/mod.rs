@@ -133,10 +133,7 @@ fn generated(seed: u64, scratch: &Path) -> anyhow::Result<Material> {
     for index in 0..=PERFORMANCES {
         let samples: Vec<_> = swing(seed, index)
             .into_iter()
-            .map(|(t_s, x)| Sample {
-                t_s,
-                position: Vector3::from(x),
-            })
+            .map(|(t_s, x)| Sample::at(t_s, Vector3::from(x)))
             .collect();
         let path = if index < PERFORMANCES {
             demos.join(format!("{index}.csv"))

@@ -42,6 +42,7 @@ pub fn follow(
         let output = controller.tick(
             Demand::Follow {
                 target,
+                orientation: None,
                 speed_scale: 1.0,
             },
             plant.q(),

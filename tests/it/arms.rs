@@ -4,7 +4,7 @@
 
 use std::sync::Arc;
 
-use nalgebra::Vector3;
+use nalgebra::{UnitQuaternion, Vector3};
 use telemime_robot::control::{
     CartesianLimits, ControlConfig, Controller, Demand, home_posture, workspace_radius,
 };
@@ -71,9 +71,22 @@ fn published_descriptions_give_their_arm_and_say_what_was_assumed() {
     }
 }
 
-/// Holds for a second, then a circle of 5 cm radius in 2 s, 3/ω ahead; returns the worst distances in m of the tip from where it
-/// started, from the filter's output, and from the circle.
-fn drive(arm: &Arc<ArmModel>) -> (f64, f64, f64) {
+/// What went wrong at worst: m, and rad.
+struct Worst {
+    /// Tip from where it started, while holding.
+    held: f64,
+    /// Tip from the filter's output.
+    servo: f64,
+    /// Tip from the circle.
+    off: f64,
+    /// Orientation from its filter's output.
+    turn_servo: f64,
+    /// Orientation from the one demanded for that moment.
+    turned_off: f64,
+}
+
+/// Holds for a second, then a circle of 5 cm radius in 2 s, 3/ω ahead; with `turning`, at the same time by that rotation vector (rad, base axes) and back.
+fn drive(arm: &Arc<ArmModel>, turning: Option<Vector3<f64>>) -> Worst {
     let home = home_posture(arm);
     let mut kinematics = Kinematics::new();
     kinematics.update(arm, &home);
@@ -81,14 +94,27 @@ fn drive(arm: &Arc<ArmModel>) -> (f64, f64, f64) {
     let mut controller =
         Controller::new(Arc::clone(arm), &ControlConfig::default(), &home).unwrap();
     let mut plant = Plant::new(Arc::clone(arm), &home).unwrap();
-    let circle = |t: f64| {
+    // Minimum jerk along the circle: it begins and ends at rest.
+    let angle = |t: f64| {
         let turned = (t.max(0.0) / 2.0).min(1.0);
-        // Minimum jerk along the circle: it begins and ends at rest.
-        let s = turned.powi(3) * (10.0 - 15.0 * turned + 6.0 * turned * turned);
-        let angle = core::f64::consts::TAU * s;
+        core::f64::consts::TAU * turned.powi(3) * (10.0 - 15.0 * turned + 6.0 * turned * turned)
+    };
+    let circle = |t: f64| {
+        let angle = angle(t);
         start + Vector3::new(0.0, angle.sin(), 1.0 - angle.cos()) * 0.05
     };
-    let (mut held, mut servo, mut off) = (0.0_f64, 0.0_f64, 0.0_f64);
+    let upright = controller.turn_reference().orientation;
+    let turn = |t: f64| {
+        let share = 0.5 * (1.0 - angle(t).cos());
+        UnitQuaternion::from_scaled_axis(turning.unwrap_or_default() * share) * upright
+    };
+    let mut worst = Worst {
+        held: 0.0,
+        servo: 0.0,
+        off: 0.0,
+        turn_servo: 0.0,
+        turned_off: 0.0,
+    };
     for tick in 0..3500 {
         let t = f64::from(tick) * DT_S - 1.0;
         let demand = if t < 0.0 {
@@ -96,6 +122,7 @@ fn drive(arm: &Arc<ArmModel>) -> (f64, f64, f64) {
         } else {
             Demand::Follow {
                 target: circle(t + controller.lag_s()),
+                orientation: turning.map(|_| turn(t + controller.lag_s())),
                 speed_scale: 1.0,
             }
         };
@@ -104,23 +131,29 @@ fn drive(arm: &Arc<ArmModel>) -> (f64, f64, f64) {
         let report = plant.step(&out.tau, DT_S);
         assert_eq!((report.stopped, report.invalid, report.clamped), (0, 0, 0));
         if t < 0.0 {
-            held = held.max((out.tip - start).norm());
+            worst.held = worst.held.max((out.tip - start).norm());
         } else {
-            servo = servo.max((out.tip - out.reference.p).norm());
-            off = off.max((out.tip - circle(t)).norm());
+            worst.servo = worst.servo.max((out.tip - out.reference.p).norm());
+            worst.off = worst.off.max((out.tip - circle(t)).norm());
+            let turn_servo = out.orientation.angle_to(&out.turn.orientation);
+            worst.turn_servo = worst.turn_servo.max(turn_servo);
+            worst.turned_off = worst.turned_off.max(out.orientation.angle_to(&turn(t)));
         }
     }
     let CartesianLimits { v_max, a_max, .. } = *controller.limits();
     println!(
-        "{}: reach {:.3} m around home, {v_max:.2} m/s, {a_max:.1} m/s²; held within {:.4} mm, filter to tip {:.3} mm, off the circle {:.3} mm, {:?}",
+        "{}: reach {:.3} m around home, {v_max:.2} m/s, {a_max:.1} m/s², {:?}; held within {:.4} mm, filter to tip {:.3} mm, off the circle {:.3} mm, orientation {:.5} rad off its filter's output and {:.5} off the one asked, {:?}",
         arm.name(),
         workspace_radius(arm, &home),
-        held * 1e3,
-        servo * 1e3,
-        off * 1e3,
+        controller.turn_limits(),
+        worst.held * 1e3,
+        worst.servo * 1e3,
+        worst.off * 1e3,
+        worst.turn_servo,
+        worst.turned_off,
         controller.counts()
     );
-    (held, servo, off)
+    worst
 }
 
 #[test]
@@ -137,9 +170,50 @@ fn published_arms_hold_and_follow_a_circle() {
         "so-arm100/so101_new_calib.urdf",
     ] {
         let Some(arm) = load(file) else { return };
-        let (held, servo, off) = drive(&arm);
+        let Worst {
+            held, servo, off, ..
+        } = drive(&arm, None);
         assert!(held < 1e-4, "{file}: {held} m");
         assert!(servo < 1e-3, "{file}: {servo} m");
         assert!(off < 4e-3, "{file}: {off} m");
+    }
+}
+
+#[test]
+fn published_arms_turn_as_they_go() {
+    for (file, turn_rad, off_at_most) in [
+        ("ur5e/ur5e.urdf", 0.25, 1e-2),
+        ("example-robot-data/panda.urdf", 0.25, 1e-2),
+        ("franka_description/fr3.urdf", 0.25, 1e-2),
+        ("drake_iiwa14/iiwa14_no_collision.urdf", 0.25, 1e-2),
+        // Its joints are slow, and its wrist bends most of the way.
+        (
+            "kinova_gen3/GEN3-7DOF-NOVISION_FOR_URDF_ARM_V12.urdf",
+            0.12,
+            1e-2,
+        ),
+        ("xarm/xarm6.urdf", 0.25, 1e-2),
+        ("xarm/xarm7.urdf", 0.25, 1e-2),
+        // Five axes cannot have both: the place is kept, and the orientation given up as far as it must be.
+        ("so-arm100/so100.urdf", 0.25, 0.6),
+        ("so-arm100/so101_new_calib.urdf", 0.25, 0.6),
+    ] {
+        let Some(arm) = load(file) else { return };
+        let straight = drive(&arm, None);
+        for axis in [Vector3::x(), Vector3::y(), Vector3::z()] {
+            let Worst {
+                servo,
+                off,
+                turn_servo,
+                turned_off,
+                ..
+            } = drive(&arm, Some(axis * turn_rad));
+            assert!(servo < 1e-3, "{file}: {servo} m");
+            assert!(off < 1.1 * straight.off, "{file}: {off} m");
+            assert!(turned_off < off_at_most, "{file}: {turned_off} rad");
+            // Wrists with friction are a few mrad behind; where an arm cannot turn, its filter waits.
+            let led_at_most = if arm.dof() > 5 { 1e-2 } else { 0.06 };
+            assert!(turn_servo < led_at_most, "{file}: {turn_servo} rad");
+        }
     }
 }

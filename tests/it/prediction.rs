@@ -224,10 +224,10 @@ fn score(model: &Model, test: &Demonstration, scores: &mut Scores) {
             let truth = test.position_at(sample.t_s + h_s) - sample.position;
             scores.add("hold", j, truth);
             scores.add("gmr", j, mixture.displacement[j - 1] - truth);
-            scores.add("blend", j, blend.knots[j].displacement - truth);
-            scores.add("cv", j, cv.knots[j].displacement - truth);
-            scores.add("damped cv", j, damped.knots[j].displacement - truth);
-            scores.add("own params", j, own.knots[j].displacement - truth);
+            scores.add("blend", j, blend.ahead.knots[j].displacement - truth);
+            scores.add("cv", j, cv.ahead.knots[j].displacement - truth);
+            scores.add("damped cv", j, damped.ahead.knots[j].displacement - truth);
+            scores.add("own params", j, own.ahead.knots[j].displacement - truth);
         }
     }
 }

@@ -134,10 +134,7 @@ impl Stage {
     fn recording(&self, name: &str, index: u32) {
         let samples: Vec<_> = telemime_sim::hand::swing(3, index)
             .into_iter()
-            .map(|(t_s, x)| Sample {
-                t_s,
-                position: Vector3::from(x),
-            })
+            .map(|(t_s, x)| Sample::at(t_s, Vector3::from(x)))
             .collect();
         let path = self.path(name);
         let text = Demonstration::from_samples(&path, &samples)

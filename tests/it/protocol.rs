@@ -4,20 +4,23 @@ use std::collections::BTreeMap;
 use std::fmt::{Debug, Display};
 use std::path::Path;
 
-use nalgebra::{SMatrix, SVector, Vector3};
+use nalgebra::{SMatrix, SVector, UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
 use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid, PathKnot};
-use telemime_protocol::checkpoint::{Checkpoint, Grid, Plan};
+use telemime_protocol::checkpoint::{Checkpoint, Grid, Plan, PosePlan};
+use telemime_protocol::pose;
 use telemime_protocol::predict::{
     BLOCK, Calibration, FEATURES, Forecast, MAX_KNOTS, Model, Regression, Standardisation, TARGETS,
+    TurnForecast, checksum,
 };
-use telemime_protocol::skill::{Gmm, Provenance, Skill, Source, Stats};
+use telemime_protocol::skill::{Gmm, Pace, Parts, Provenance, Samples, Skill, Source, Stats};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::{self, Frame};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots;
 use telemime_protocol::wire::state::WireState;
+use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::{
     Cause, Drive, Engage, Info, Message, Motion, OperatorControl, OperatorDatagram, PathTail,
     Refusal, RobotControl, RobotDatagram, RobotState, Telemetry, WireParams, model_tag,
@@ -38,6 +41,19 @@ const PARAMS: WireParams = WireParams {
     trust: 230,
     cv_damping: 128,
 };
+
+const TURN: WireTurn = WireTurn {
+    q: WireRotation([4_000, -2_500, 0]),
+    memory_exponent: 6,
+    memory: [[20, -10, 0], [40, -20, 3], [70, -30, 5], [90, -40, 8]],
+    params: WireParams {
+        gain: 255,
+        trust: 255,
+        cv_damping: 128,
+    },
+};
+
+const TIP_Q: WireRotation = WireRotation([7_869, -3_976, 0]);
 
 const KNOTS: [PathKnot; 2] = [
     PathKnot {
@@ -68,12 +84,13 @@ fn motion(checksum: Option<u32>) -> Motion {
         params: PARAMS,
         checksum,
         state: STATE,
+        pose: WirePose::default(),
         first_knot: 3,
         knots: knots::pack(&STATE, grid(), &KNOTS).unwrap(),
     }
 }
 
-fn plan() -> Plan<3> {
+fn plan() -> PosePlan {
     let point = |t_s, x: [f64; 3]| Checkpoint {
         t_s,
         x: SVector::from(x),
@@ -83,7 +100,9 @@ fn plan() -> Plan<3> {
         point(0.25, [0.15, 0.05, -0.3]),
         point(0.4, [0.2, 0.01, 0.7]),
     ];
-    Plan::quantise(Grid::for_bound(0.004).unwrap(), &points).unwrap()
+    Plan::quantise(Grid::for_bound(0.004).unwrap(), &points)
+        .unwrap()
+        .into()
 }
 
 /// Two components, three knots; every number is a short binary fraction, so that it survives f32.
@@ -145,7 +164,26 @@ fn skill() -> Skill {
             sha256: [0xab; 32],
         }],
     };
-    Skill::new("wave".to_owned(), &motion, 2.0, &model, stats, provenance).unwrap()
+    Skill::new(Parts {
+        name: "wave".to_owned(),
+        motion,
+        duration_s: 2.0,
+        pace: Pace {
+            mean_ln_s: 0.75,
+            deviation_ln: 0.125,
+        },
+        predictor: model,
+        turn: None,
+        grip: None,
+        task: None,
+        stats,
+        samples: Samples {
+            motion: 60,
+            predictor: 58,
+        },
+        provenance,
+    })
+    .unwrap()
 }
 
 fn info() -> Info {
@@ -180,6 +218,8 @@ fn telemetry() -> Telemetry {
         tick_p99_ns: 30_000,
         overruns: 0,
         tip_m: [0.5, 0.0, 0.25],
+        tip_q: TIP_Q,
+        grip: Some(255),
         q: vec![0.0, 1.0],
     }
 }
@@ -193,7 +233,7 @@ fn message<M: Message + PartialEq + Debug>(message: &M) -> Vec<u8> {
 
 fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
     let stop = message(&OperatorControl::EmergencyStop);
-    let checksum = Forecast::constant_velocity(&STATE.dequantise(), &PARAMS.dequantise());
+    let straight = Forecast::constant_velocity(&STATE.dequantise(), &PARAMS.dequantise());
     let rotation = [0.5, -0.5, 0.5, -0.5];
     let engage = |drive| {
         OperatorControl::Engage(Engage {
@@ -210,6 +250,7 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
         state: STATE,
         model: 0,
         params: PARAMS,
+        pose: WirePose::default(),
     };
     let hello = Hello {
         min: 1,
@@ -258,6 +299,8 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
                 t_us: 3_050_000,
                 hand_m: [0.5, -0.25, 2.5],
                 tip_m: [0.5, 0.0, 0.25],
+                hand_q: None,
+                tip_q: TIP_Q,
             }),
         ),
         (
@@ -276,7 +319,20 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
         ),
         (
             "motion",
-            message(&OperatorDatagram::Motion(motion(Some(checksum.checksum())))),
+            message(&OperatorDatagram::Motion(motion(Some(checksum(
+                &straight, None,
+            ))))),
+        ),
+        (
+            "motion-pose",
+            message(&OperatorDatagram::Motion(Motion {
+                pose: WirePose {
+                    turn: Some(TURN),
+                    grip: Some(200),
+                },
+                knots: Vec::new(),
+                ..motion(None)
+            })),
         ),
         (
             "go",
@@ -326,11 +382,32 @@ fn values() -> BTreeMap<String, String> {
     let straight = Forecast::constant_velocity(&state, &params);
     say("cv(0.1)", vector(&straight.at(0.1).position));
     say("cv sigma(0.1)", format!("{:.9}", straight.at(0.1).sigma_m));
-    say("cv checksum", format!("{:08x}", straight.checksum()));
+    say("cv checksum", format!("{:08x}", checksum(&straight, None)));
 
     let mut advanced = state;
     assert!(advanced.advance(Stamp(3_033_000_000), Vector3::new(0.41, -0.2, 2.5)));
     (0..4).for_each(|i| say(&format!("next m{}", i + 1), vector(&advanced.memory[i])));
+
+    let turn = TURN.dequantise(state.t);
+    let turned = |q: &UnitQuaternion<f64>| vector(&pose::log(q));
+    say("turn m1", turned(&turn.memory[0]));
+    say("turn m4", turned(&turn.memory[3]));
+    let turning = TurnForecast::constant_velocity(&turn, &TURN.params.dequantise());
+    say("turn cv(0.1)", turned(&turning.at(0.1).orientation));
+    say(
+        "turn cv sigma(0.1)",
+        format!("{:.9}", turning.at(0.1).sigma_rad),
+    );
+    say(
+        "turn checksum",
+        format!("{:08x}", checksum(&straight, Some(&turning))),
+    );
+    let mut next = turn;
+    assert!(next.advance(
+        Stamp(3_033_000_000),
+        pose::exp(&Vector3::new(0.45, -0.3, 0.05))
+    ));
+    say("turn next m1", turned(&next.memory[0]));
 
     let skill = skill();
     let forecast = skill.predictor().forecast(&state, &params);
@@ -340,13 +417,16 @@ fn values() -> BTreeMap<String, String> {
     say("skill tag", model_tag(&skill.id().0).to_string());
     say("novelty", format!("{:.9}", posterior.novelty));
     say("mixture(3)", vector(&posterior.displacement[2]));
-    say("weight", format!("{:.9}", forecast.weight));
+    say("weight", format!("{:.9}", forecast.ahead.weight));
     say("blend(0.1)", vector(&forecast.at(0.1).position));
     say(
         "blend sigma(0.1)",
         format!("{:.9}", forecast.at(0.1).sigma_m),
     );
-    say("blend checksum", format!("{:08x}", forecast.checksum()));
+    say(
+        "blend checksum",
+        format!("{:08x}", checksum(&forecast, None)),
+    );
 
     let mut path = PathDecoder::new(grid(), 8);
     knots::unpack(&STATE, grid(), &motion(None).knots)
@@ -359,7 +439,7 @@ fn values() -> BTreeMap<String, String> {
     say("path x(2.5)", vector(&jet.x));
     say("path v(2.5)", vector(&jet.v));
 
-    let jet = plan().spline().unwrap().eval(0.1).unwrap();
+    let jet = plan().position().spline().unwrap().eval(0.1).unwrap();
     say("plan x(0.1)", vector(&jet.x));
     say("plan v(0.1)", vector(&jet.v));
     say("plan a(0.1)", vector(&jet.a));
@@ -455,6 +535,7 @@ fn a_plan_that_does_not_begin_at_zero_is_refused() {
         x: SVector::from([0.0, 0.0, t_s]),
     };
     let late = Plan::quantise(Grid::for_bound(0.004).unwrap(), &[point(0.5), point(1.0)]).unwrap();
+    let late = PosePlan::from(late);
     let mut ask = |message: OperatorControl| {
         let frame = Frame {
             ignorable: false,

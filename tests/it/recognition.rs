@@ -106,13 +106,9 @@ fn text(bytes: &[u8]) -> &str {
 
 fn save(folder: &Path, name: &str, samples: impl IntoIterator<Item = (f64, Vector3<f64>)>) {
     std::fs::create_dir_all(folder).unwrap();
-    let samples: Vec<_> = samples.into_iter().map(|(t, x)| sample(t, x)).collect();
+    let samples: Vec<_> = samples.into_iter().map(|(t, x)| Sample::at(t, x)).collect();
     let d = Demonstration::from_samples(name, &samples).unwrap();
     std::fs::write(folder.join(format!("{name}.csv")), d.to_csv()).unwrap();
-}
-
-fn sample(t_s: f64, position: Vector3<f64>) -> Sample {
-    Sample { t_s, position }
 }
 
 /// A person's swings, by `sim::hand`.

@@ -58,8 +58,10 @@ pub(crate) fn skill() -> Arc<Skill> {
     let learn = || {
         let demonstrations: Vec<_> = (0..5)
             .map(|index| {
-                let sample = |(t_s, position): (f64, Vector3<f64>)| Sample { t_s, position };
-                let samples: Vec<_> = performance(index).into_iter().map(sample).collect();
+                let samples: Vec<_> = performance(index)
+                    .into_iter()
+                    .map(|(t_s, position)| Sample::at(t_s, position))
+                    .collect();
                 Demonstration::from_samples(format!("swing {index}"), &samples).unwrap()
             })
             .collect();
@@ -79,7 +81,10 @@ pub(crate) fn rig() -> Rig {
 /// A replay of `samples` after a moment of rest.
 pub(crate) fn replay(samples: Samples) -> Task {
     Task::replay(Recording {
-        samples,
+        samples: samples
+            .into_iter()
+            .map(|(t_s, x)| Sample::at(t_s, x))
+            .collect(),
         rest_s: REST_S,
     })
 }

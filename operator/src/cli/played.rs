@@ -1,22 +1,24 @@
 //! What became of a played skill: where the tip was, by the robot's telemetry, against where it was sent.
 
 use nalgebra::{UnitQuaternion, Vector3};
-use telemime_protocol::spline::BSpline;
+use telemime_protocol::checkpoint::PoseCurve;
 use telemime_protocol::wire::v1::{RobotState, Telemetry};
 
-use super::report::{Event, Scores};
+use super::report::{Event, Scores, TurnScores};
 use crate::learn::align::Aligned;
 use crate::session;
 
 /// A skill being played, and the tip as heard of.
 pub(super) struct Played {
-    spline: BSpline<3>,
+    curve: PoseCurve,
     demonstrations: Option<Aligned>,
     rotation: UnitQuaternion<f64>,
     scale: f64,
     engaged: Option<Engaged>,
     /// Time since the engage (s) and the tip mapped back to the hand (m).
     tip: Vec<(f64, Vector3<f64>)>,
+    /// The same for its orientation, where that is followed.
+    turn: Vec<(f64, UnitQuaternion<f64>)>,
 }
 
 struct Engaged {
@@ -24,21 +26,24 @@ struct Engaged {
     t_us: i64,
     hand_m: Vector3<f64>,
     tip_m: Vector3<f64>,
+    hand_q: Option<UnitQuaternion<f64>>,
+    tip_q: UnitQuaternion<f64>,
 }
 
 impl Played {
     pub(super) fn new(
-        spline: BSpline<3>,
+        curve: PoseCurve,
         demonstrations: Option<Aligned>,
         rotation: UnitQuaternion<f64>,
     ) -> Self {
         Self {
-            spline,
+            curve,
             demonstrations,
             rotation,
             scale: 1.0,
             engaged: None,
             tip: Vec::new(),
+            turn: Vec::new(),
         }
     }
 
@@ -55,12 +60,16 @@ impl Played {
                 t_us,
                 hand_m,
                 tip_m,
+                hand_q,
+                tip_q,
             } => {
                 self.engaged = Some(Engaged {
                     number: *engagement,
                     t_us: *t_us,
                     hand_m: metres(hand_m),
                     tip_m: metres(tip_m),
+                    hand_q: *hand_q,
+                    tip_q: *tip_q,
                 });
             }
             session::Event::Telemetry(telemetry) => self.take(telemetry),
@@ -77,27 +86,40 @@ impl Played {
             let tip_m = Vector3::from(telemetry.tip_m).cast::<f64>();
             let moved = self.rotation.inverse() * (tip_m - engaged.tip_m) / self.scale;
             self.tip.push((t_s, engaged.hand_m + moved));
+            if let Some(hand_q) = engaged.hand_q {
+                let turned = telemetry.tip_q.dequantise() * engaged.tip_q.inverse();
+                let turned = self.rotation.inverse() * turned * self.rotation;
+                self.turn.push((t_s, turned * hand_q));
+            }
         }
     }
 
     /// The scores, if the robot was heard of while it played.
     pub(super) fn scores(&self) -> Option<Event> {
-        let (start_s, end_s) = self.spline.span_s();
+        let end_s = self.curve.end_s();
         let (sent, followed): (Vec<_>, Vec<_>) = self
             .tip
             .iter()
-            .filter_map(|(t_s, tip)| Some((self.spline.eval(*t_s).ok()?.x, *tip)))
+            .filter(|(t_s, _)| *t_s <= end_s)
+            .map(|(t_s, tip)| (self.curve.position_at(*t_s), *tip))
             .unzip();
         if sent.len() < 2 {
             return None;
         }
         let demonstrations = self.demonstrations.as_ref().map(|aligned| {
-            Scores::of_demonstrations(aligned, |t_s| self.tip_at(t_s.clamp(start_s, end_s)))
+            Scores::of_demonstrations(aligned, |t_s| self.tip_at(t_s.clamp(0.0, end_s)))
         });
         Some(Event::Played {
             samples: sent.len(),
             rebuilt_to_tip: Scores::of(&sent, &followed),
             demonstrations_to_tip: demonstrations,
+            turn_to_tip: (!self.turn.is_empty()).then(|| {
+                TurnScores::of(
+                    self.turn
+                        .iter()
+                        .filter_map(|(t_s, q)| Some(self.curve.orientation_at(*t_s)?.angle_to(q))),
+                )
+            }),
         })
     }
 
@@ -118,7 +140,8 @@ impl Played {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use telemime_protocol::spline::End;
+    use telemime_protocol::checkpoint::select;
+    use telemime_protocol::wire::turn::WireRotation;
 
     #[test]
     fn a_tip_that_does_as_it_is_told_scores_one() {
@@ -128,9 +151,12 @@ mod tests {
             Vector3::new(0.4, 0.3, 2.2),
             Vector3::new(0.2, 0.5, 2.1),
         ];
-        let spline = BSpline::<3>::interpolate(&t, &x, End::Natural).unwrap();
+        let plan = select::bounded(&t, &x, 1e-6).unwrap();
+        let curve = telemime_protocol::checkpoint::PosePlan::from(plan)
+            .curve()
+            .unwrap();
         let rotation = UnitQuaternion::from_euler_angles(0.1, 0.2, 0.3);
-        let mut played = Played::new(spline.clone(), None, rotation);
+        let mut played = Played::new(curve.clone(), None, rotation);
         assert_eq!(played.scores(), None);
         played.mapped(0.25);
         played.hear(&session::Event::Engaged {
@@ -138,10 +164,12 @@ mod tests {
             t_us: 1_000_000,
             hand_m: [0.1, 0.0, 2.0],
             tip_m: [0.5, 0.0, 0.4],
+            hand_q: None,
+            tip_q: UnitQuaternion::identity(),
         });
         for i in 0..=20 {
             let t_s = f64::from(i) * 0.05;
-            let hand = spline.eval(t_s).unwrap().x - x[0];
+            let hand = curve.position_at(t_s) - x[0];
             let tip = Vector3::new(0.5, 0.0, 0.4) + rotation * hand * 0.25;
             let telemetry = Telemetry {
                 epoch: 1,
@@ -161,6 +189,8 @@ mod tests {
                 tick_p99_ns: 0,
                 overruns: 0,
                 tip_m: tip.cast::<f32>().into(),
+                tip_q: WireRotation::default(),
+                grip: None,
                 q: Vec::new(),
             };
             played.hear(&session::Event::Telemetry(Box::new(telemetry)));

@@ -75,6 +75,31 @@ impl Scores {
     }
 }
 
+/// How far an orientation is off.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct TurnScores {
+    /// Root mean square of the angle, rad.
+    pub rms_rad: f64,
+    /// Largest angle, rad.
+    pub max_rad: f64,
+}
+
+impl TurnScores {
+    /// Of these angles, rad.
+    pub fn of(angles: impl Iterator<Item = f64>) -> Self {
+        let (mut n, mut square, mut max_rad) = (0_u32, 0.0, 0.0_f64);
+        for angle in angles {
+            n += 1;
+            square += angle * angle;
+            max_rad = max_rad.max(angle);
+        }
+        Self {
+            rms_rad: (square / f64::from(n.max(1))).sqrt(),
+            max_rad,
+        }
+    }
+}
+
 /// What playing a skill sends.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PlayReport {
@@ -88,10 +113,16 @@ pub struct PlayReport {
     pub samples: usize,
     /// Checkpoints that stand for them.
     pub checkpoints: usize,
+    /// Those of the orientation, where the skill has it.
+    pub turn_checkpoints: Option<usize>,
+    /// Those of the gripper, where the skill has it.
+    pub grip_checkpoints: Option<usize>,
     /// Bytes of the encoded plan.
     pub bytes: usize,
     /// The rebuilt motion against the inferred one.
     pub rebuilt: Scores,
+    /// The rebuilt orientation against the inferred one.
+    pub rebuilt_turn: Option<TurnScores>,
     /// The checkpoints: time (s) and position (m).
     pub points: Vec<(f64, [f64; 3])>,
 }
@@ -161,6 +192,7 @@ pub enum Event {
         samples: usize,
         rebuilt_to_tip: Scores,
         demonstrations_to_tip: Option<Scores>,
+        turn_to_tip: Option<TurnScores>,
     },
     Done {
         completed: bool,
@@ -224,15 +256,23 @@ impl Event {
                 )
             }
             Self::Plan(p) => format!(
-                "{}: {:.2} s in {} checkpoints ({} B) for {} samples; rebuilt within {:.2} mm of {:.2} mm allowed, R² {:.6}",
+                "{}: {:.2} s in {} checkpoints{}{} ({} B) for {} samples; rebuilt within {:.2} mm of {:.2} mm allowed, R² {:.6}{}",
                 p.skill,
                 p.duration_s,
                 p.checkpoints,
+                p.turn_checkpoints
+                    .map_or(String::new(), |n| format!(", {n} of orientation")),
+                p.grip_checkpoints
+                    .map_or(String::new(), |n| format!(", {n} of the gripper")),
                 p.bytes,
                 p.samples,
                 p.rebuilt.max_m * 1e3,
                 p.bound_m * 1e3,
-                p.rebuilt.r2
+                p.rebuilt.r2,
+                p.rebuilt_turn.map_or(String::new(), |turn| format!(
+                    ", orientation within {:.2}°",
+                    turn.max_rad.to_degrees()
+                ))
             ),
             Self::Dialling { why } => format!("dialling: {why}"),
             Self::Connected { epoch } => format!("connected (session {epoch})"),
@@ -257,6 +297,7 @@ impl Event {
                 samples,
                 rebuilt_to_tip,
                 demonstrations_to_tip,
+                turn_to_tip,
             } => {
                 let line = |s: &Scores| {
                     format!(
@@ -274,6 +315,13 @@ impl Event {
                     text.push_str(&format!(
                         "; against the aligned demonstrations: {}",
                         line(scores)
+                    ));
+                }
+                if let Some(turn) = turn_to_tip {
+                    text.push_str(&format!(
+                        "; orientation {:.2}° RMS, {:.2}° at most",
+                        turn.rms_rad.to_degrees(),
+                        turn.max_rad.to_degrees()
                     ));
                 }
                 text

@@ -4,13 +4,10 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, bail};
-use nalgebra::{SVector, Vector3};
-use telemime_protocol::checkpoint::{Plan, select};
-use telemime_protocol::skill::{Gmr, MAX_COMPONENTS, MAX_NAME_BYTES, Skill};
-use telemime_protocol::wire::codec;
+use telemime_protocol::skill::{MAX_COMPONENTS, MAX_NAME_BYTES, Skill};
 
 use super::Args;
-use super::report::{Event, Log, PlayReport, Scores};
+use super::report::{Event, Log};
 use crate::demonstration::{Demonstration, Demonstrations};
 use crate::learn::align::{Aligned, align};
 use crate::learn::{LearnOptions, Progress, learn_skill};
@@ -18,9 +15,6 @@ use crate::skill_file;
 
 /// Components of one mixture per skill when several share it (prediction.md §1).
 const SHARED_COMPONENTS: usize = 7;
-
-/// Inferred motions are sampled at this interval before they are compressed, s.
-const SAMPLE_S: f64 = 0.02;
 
 /// Skills by name, and the one mixture that mirrors them all.
 #[derive(Debug)]
@@ -196,39 +190,4 @@ fn learn(
         reach_m: skill.stats().reach_m,
     });
     Ok(skill)
-}
-
-/// The skill's motion by regression over time, compressed to checkpoints within `bound_m` of it.
-///
-/// # Errors
-/// A bound that cannot be held.
-pub fn infer(skill: &Skill, bound_m: f64) -> anyhow::Result<(Plan<3>, PlayReport)> {
-    let gmr = Gmr::<1, 3>::new(skill.motion())?;
-    let steps = (skill.duration_s() / SAMPLE_S).ceil().max(2.0) as usize;
-    let t: Vec<f64> = (0..=steps)
-        .map(|i| skill.duration_s() * i as f64 / steps as f64)
-        .collect();
-    let inferred: Vec<Vector3<f64>> = t
-        .iter()
-        .map(|&t| gmr.query(&SVector::from([t])).mean)
-        .collect();
-    let plan =
-        select::bounded(&t, &inferred, bound_m).with_context(|| format!("--bound {bound_m}"))?;
-    let spline = plan.spline()?;
-    let (start_s, end_s) = spline.span_s();
-    let rebuilt = t
-        .iter()
-        .map(|&t| spline.eval(t.clamp(start_s, end_s)).map(|jet| jet.x))
-        .collect::<Result<Vec<_>, _>>()?;
-    let report = PlayReport {
-        skill: skill.name().to_owned(),
-        duration_s: skill.duration_s(),
-        bound_m,
-        samples: t.len(),
-        checkpoints: plan.len(),
-        bytes: codec::encode(&plan).len(),
-        rebuilt: Scores::of(&inferred, &rebuilt),
-        points: plan.checkpoints().map(|c| (c.t_s, c.x.into())).collect(),
-    };
-    Ok((plan, report))
 }

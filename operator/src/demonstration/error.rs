@@ -36,7 +36,7 @@ pub enum DemonstrationError {
         path: PathBuf,
     },
     /// A column is missing from the header, or there twice.
-    #[error("{}, line 1: {}column {column:?} in {found:?}; the header must name t,x,y,z (s, m) once each", path.display(), if *twice { "second " } else { "no " })]
+    #[error("{}, line 1: {}column {column:?} in {found:?}; the header must name t,x,y,z (s, m) once each, and all of qw,qx,qy,qz or none", path.display(), if *twice { "second " } else { "no " })]
     Column {
         /// The file.
         path: PathBuf,
@@ -79,6 +79,26 @@ pub enum DemonstrationError {
         /// The column.
         column: &'static str,
         /// The number.
+        value: f64,
+    },
+    /// Four numbers that are not a rotation.
+    #[error("{}, line {line}: qw,qx,qy,qz have norm {norm}, not 1; correct or remove the line", path.display())]
+    NotARotation {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: u64,
+        /// Their norm.
+        norm: f64,
+    },
+    /// A gripper's opening outside its range.
+    #[error("{}, line {line}: grip is {value}, expected 0 (closed) to 1 (open); scale the column", path.display())]
+    Grip {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: u64,
+        /// The opening.
         value: f64,
     },
     /// Time stands still or runs backwards.

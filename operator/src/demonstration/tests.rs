@@ -18,7 +18,7 @@ fn with(line: usize, text: &str) -> Result<Demonstration, DemonstrationError> {
 
 #[test]
 fn columns_may_come_in_any_order_with_others_between() {
-    let rows = good("qw, z,t,x,note,y", |i| {
+    let rows = good("weather, z,t,x,note,y", |i| {
         format!("1,3,{},{i},hi,2", i as f64 * 0.1)
     });
     let d = lines(&rows.iter().map(String::as_str).collect::<Vec<_>>()).unwrap();
@@ -26,7 +26,7 @@ fn columns_may_come_in_any_order_with_others_between() {
     assert_eq!(d.name(), "take");
     assert_eq!(
         d.notices()[0].to_string(),
-        "skill/take.csv: columns qw, note ignored"
+        "skill/take.csv: columns weather, note ignored"
     );
 }
 
@@ -113,7 +113,7 @@ fn a_folder_is_a_skill() {
         skill.demonstrations[1].sha256()
     );
 
-    let wider = good("t,x,y,z,qw", |i| format!("{i},1,2,3,1")).join("\n");
+    let wider = good("t,x,y,z,grip", |i| format!("{i},1,2,3,1")).join("\n");
     fs::write(dir.join("c.csv"), wider).unwrap();
     assert!(matches!(
         Demonstrations::read_dir(&dir, None),
@@ -124,9 +124,11 @@ fn a_folder_is_a_skill() {
 #[test]
 fn samples_survive_their_csv_to_the_bit() {
     let samples: Vec<Sample> = (0..9)
-        .map(|i| Sample {
-            t_s: f64::from(i) / 30.0,
-            position: Vector3::new(0.1, -1.0 / 3.0, 1e-9 * f64::from(i)),
+        .map(|i| {
+            Sample::at(
+                f64::from(i) / 30.0,
+                Vector3::new(0.1, -1.0 / 3.0, 1e-9 * f64::from(i)),
+            )
         })
         .collect();
     let d = Demonstration::from_samples("made", &samples).unwrap();
@@ -167,4 +169,61 @@ fn times_count_from_the_first_sample_whatever_the_clock() {
         .collect();
     let read = Demonstration::parse("unix.csv", format!("t,x,y,z\n{rows}").as_bytes()).unwrap();
     assert_eq!((read.samples()[0].t_s, read.last().t_s), (0.0, 9.0));
+}
+
+fn posed(line: usize, text: &str) -> Result<Demonstration, DemonstrationError> {
+    let mut rows = good("t,x,y,z,qw,qx,qy,qz,grip", |i| {
+        // Written with the other sign at every second sample.
+        let (half, sign) = (0.05 * i as f64, if i % 2 == 0 { 1.0 } else { -1.0 });
+        let (w, z) = (sign * half.cos(), sign * half.sin());
+        format!(
+            "{},1,2,3,{w:.4},0,0,{z:.4},{}",
+            i as f64 * 0.1,
+            0.1 * i as f64
+        )
+    });
+    rows[line - 1] = text.to_owned();
+    lines(&rows.iter().map(String::as_str).collect::<Vec<_>>())
+}
+
+#[test]
+fn orientation_and_gripper_are_read_interpolated_and_written() {
+    let header = "t,x,y,z,qw,qx,qy,qz,grip";
+    let d = posed(1, header).unwrap();
+    assert!(d.has_orientation() && d.has_grip() && d.notices().is_empty());
+    for pair in d.samples().windows(2) {
+        let (a, b) = (pair[0].orientation.unwrap(), pair[1].orientation.unwrap());
+        assert!(a.coords.dot(&b.coords) > 0.99, "{a} {b}");
+    }
+    let between = d.orientation_at(0.25).unwrap();
+    assert!((between.scaled_axis() - Vector3::z() * 0.25).norm() < 2e-4);
+    assert!((d.grip_at(0.25).unwrap() - 0.25).abs() < 1e-12);
+    assert!(d.orientation_at(99.0).unwrap().angle() > 0.89);
+    let again = Demonstration::parse("again.csv", d.to_csv().as_bytes()).unwrap();
+    for (a, b) in d.samples().iter().zip(again.samples()) {
+        assert_eq!((a.position, a.grip), (b.position, b.grip));
+        assert!(a.orientation.unwrap().angle_to(&b.orientation.unwrap()) < 1e-15);
+    }
+    let without = good("t,x,y,z", |i| format!("{},{i},2,3", i as f64 * 0.1));
+    let without = lines(&without.iter().map(String::as_str).collect::<Vec<_>>()).unwrap();
+    assert!(!without.has_orientation() && !without.has_grip());
+    assert_eq!(
+        (without.orientation_at(0.1), without.grip_at(0.1)),
+        (None, None)
+    );
+}
+
+#[test]
+fn a_faulty_orientation_or_gripper_is_refused() {
+    let refused = |line, text| posed(line, text).unwrap_err().to_string();
+    let says = |text: String, words: &str| assert!(text.contains(words), "{text}");
+    says(refused(1, "t,x,y,z,qw,qx,qy,a,grip"), "no column \"qz\"");
+    says(
+        refused(4, "0.2,1,2,3,1,0,0.5,0,1"),
+        "line 4: qw,qx,qy,qz have norm 1.1",
+    );
+    says(refused(4, "0.2,1,2,3,0,0,0,0,1"), "norm 0");
+    says(refused(4, "0.2,1,2,3,nan,0,0,0,1"), "norm NaN");
+    says(refused(4, "0.2,1,2,3,1,0,0,0,1.5"), "line 4: grip is 1.5");
+    says(refused(4, "0.2,1,2,3,1,0,0,0,nan"), "line 4: grip is NaN");
 }

@@ -173,10 +173,10 @@ mod tests {
             .map(|i| {
                 let u = f64::from(i) / 59.0;
                 let p = warp(u);
-                Sample {
-                    t_s: 5.0 + u * duration_s,
-                    position: Vector3::new((6.0 * p).sin() + offset, (4.0 * p).cos(), p),
-                }
+                Sample::at(
+                    5.0 + u * duration_s,
+                    Vector3::new((6.0 * p).sin() + offset, (4.0 * p).cos(), p),
+                )
             })
             .collect();
         Demonstration::from_samples(name, &samples).unwrap()

@@ -1,7 +1,9 @@
 //! From demonstrations to a [`Skill`]: alignment, the motion's mixture, the predictor, both calibrated.
 
 pub mod align;
+pub mod compare;
 pub mod em;
+pub mod grip;
 pub mod kmeans;
 pub mod motion;
 pub mod predictor;
@@ -10,10 +12,13 @@ mod stats;
 #[cfg(test)]
 mod tests;
 mod trial;
+pub mod turn;
+pub mod variational;
 
 use telemime_protocol::predict::ModelError;
 use telemime_protocol::skill::{
-    Gmm, MAX_COMPONENTS, MAX_NAME_BYTES, MAX_SOURCES, Provenance, Skill, SkillError, Source,
+    MAX_COMPONENTS, MAX_NAME_BYTES, MAX_SOURCES, Pace, Parts, Provenance, Samples, Skill,
+    SkillError, Source, Turn,
 };
 
 use crate::demonstration::Demonstration;
@@ -56,6 +61,20 @@ pub enum LearnError {
     OutOfRange {
         /// Its index.
         row: usize,
+    },
+    /// A mixture cannot stand for this many samples.
+    #[error(
+        "a mixture of {found} effective samples cannot be refined: a positive number is needed"
+    )]
+    EffectiveSamples {
+        /// The number.
+        found: f64,
+    },
+    /// A prior that is no prior.
+    #[error("a prior of {found}: concentration and mean precision are positive numbers")]
+    Prior {
+        /// Its value.
+        found: f64,
     },
     /// The data span no volume, and no ridge was allowed.
     #[error("the data lie in a subspace: no mixture of full covariance fits without a ridge")]
@@ -107,7 +126,7 @@ pub enum Progress {
         components: usize,
         /// Mean log likelihood, nats a sample (s, m).
         score: f64,
-        /// Components that died and were started again or removed.
+        /// Components that died and were started again or removed, and what floors and shrinkage stand for.
         degenerate: Vec<em::Degenerate>,
     },
     /// A predictor was trained without one demonstration and tried on it.
@@ -156,14 +175,59 @@ pub fn learn_skill(
         options.seed,
         &mut progress,
     )?;
-    assemble(
-        name,
-        demonstrations,
-        &motion,
-        aligned.duration_s,
-        &predictor,
-        options.seed,
-    )
+    let turn = if demonstrations.iter().all(Demonstration::has_orientation) {
+        Some(Turn {
+            motion: turn::fit(&aligned, demonstrations)?,
+            predictor: predictor::train_turns(
+                demonstrations,
+                &options.predictor,
+                options.seed,
+                &mut progress,
+            )?,
+        })
+    } else {
+        None
+    };
+    let grip = if demonstrations.iter().all(Demonstration::has_grip) {
+        Some(grip::fit(&aligned, demonstrations, options.seed)?)
+    } else {
+        None
+    };
+    Ok(Skill::new(Parts {
+        name: name.to_owned(),
+        motion,
+        duration_s: aligned.duration_s,
+        pace: pace(demonstrations),
+        predictor,
+        turn,
+        grip,
+        task: None,
+        stats: statistics(demonstrations),
+        samples: samples(&aligned, demonstrations),
+        provenance: provenance(demonstrations, options.seed),
+    })?)
+}
+
+/// The log-normal distribution of the durations; never narrower than 5 %, which is all that a handful of
+/// performances can show.
+fn pace(demonstrations: &[Demonstration]) -> Pace {
+    const LEAST: f64 = 0.05;
+    let n = demonstrations.len() as f64;
+    let ln: Vec<f64> = demonstrations.iter().map(|d| d.duration_s().ln()).collect();
+    let mean_ln_s = ln.iter().sum::<f64>() / n;
+    let square = ln.iter().map(|v| (v - mean_ln_s).powi(2)).sum::<f64>();
+    Pace {
+        mean_ln_s,
+        deviation_ln: (square / (n - 1.0).max(1.0)).sqrt().max(LEAST),
+    }
+}
+
+fn samples(aligned: &align::Aligned, demonstrations: &[Demonstration]) -> Samples {
+    let count = |n: usize| u32::try_from(n).unwrap_or(u32::MAX).max(1);
+    Samples {
+        motion: count(aligned.paths.len() * aligned.times_s.len()),
+        predictor: count(demonstrations.iter().map(|d| d.samples().len()).sum()),
+    }
 }
 
 /// A recording's name, as much of it as a skill holds.
@@ -175,14 +239,7 @@ fn short(name: &str) -> String {
     name
 }
 
-fn assemble(
-    name: &str,
-    demonstrations: &[Demonstration],
-    motion: &Gmm<4>,
-    duration_s: f64,
-    predictor: &telemime_protocol::predict::Model,
-    seed: u64,
-) -> Result<Skill, LearnError> {
+fn provenance(demonstrations: &[Demonstration], seed: u64) -> Provenance {
     let sources = demonstrations
         .iter()
         .map(|d| Source {
@@ -190,18 +247,9 @@ fn assemble(
             sha256: *d.sha256(),
         })
         .collect();
-    let provenance = Provenance {
+    Provenance {
         producer: concat!("telemime ", env!("CARGO_PKG_VERSION")).to_owned(),
         seed,
         sources,
-    };
-    let stats = statistics(demonstrations);
-    Ok(Skill::new(
-        name.to_owned(),
-        motion,
-        duration_s,
-        predictor,
-        stats,
-        provenance,
-    )?)
+    }
 }

@@ -1,6 +1,6 @@
 //! The motion to play: a mixture over time and position, of the aligned demonstrations.
 
-use nalgebra::{SVector, Vector4};
+use nalgebra::{Matrix3, SVector, Vector3, Vector4};
 use telemime_protocol::skill::{Gmm, Gmr};
 
 use super::align::Aligned;
@@ -18,22 +18,23 @@ const LADDER: [usize; 20] = [
     1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20, 24, 28, 33, 39, 46, 54, 64,
 ];
 
-/// Rows (t s, x m, y m, z m), demonstration by demonstration, evenly thinned to about [`MOST_ROWS`].
-fn rows(aligned: &Aligned) -> Vec<Vector4<f64>> {
+/// Rows (t s, x m, y m, z m) of each demonstration, evenly thinned to about [`MOST_ROWS`] in all.
+pub fn rows(aligned: &Aligned) -> Vec<Vec<Vector4<f64>>> {
     let total = aligned.paths.len() * aligned.times_s.len();
     let step = total.div_ceil(MOST_ROWS);
-    let mut rows = Vec::with_capacity(total / step + aligned.paths.len());
-    for (n, path) in aligned.paths.iter().enumerate() {
+    let each = |(n, path): (usize, &Vec<Vector3<f64>>)| {
         // Offset from one to the next, so that together they cover every moment.
-        let each = aligned
+        let samples = aligned
             .times_s
             .iter()
             .zip(path)
             .skip(n % step)
             .step_by(step);
-        rows.extend(each.map(|(t_s, p)| Vector4::new(*t_s, p.x, p.y, p.z)));
-    }
-    rows
+        samples
+            .map(|(t_s, p)| Vector4::new(*t_s, p.x, p.y, p.z))
+            .collect()
+    };
+    aligned.paths.iter().enumerate().map(each).collect()
 }
 
 /// Fits the mixture over (t s, x m, y m, z m), its number of components by BIC.
@@ -50,7 +51,7 @@ pub fn fit(
     options: &LearnOptions,
     progress: &mut impl FnMut(Progress),
 ) -> Result<Gmm<4>, LearnError> {
-    let rows = rows(aligned);
+    let rows = rows(aligned).concat();
     let mut best: Result<(f64, Fit<4>), LearnError> = Err(LearnError::Components { asked: 0 });
     for components in LADDER
         .into_iter()
@@ -100,11 +101,16 @@ fn regression_score(gmm: &Gmm<4>, rows: &[Vector4<f64>]) -> Result<f64, LearnErr
     let mut sum = 0.0;
     for row in rows {
         let at = gmr.query(&SVector::from([row[0]]));
-        let factor = at.covariance.cholesky().ok_or(LearnError::Singular)?;
         let error = row.fixed_rows::<3>(1) - at.mean;
-        let distance2 = error.dot(&factor.solve(&error));
-        let log_det: f64 = (0..3).map(|d| factor.l_dirty()[(d, d)].ln()).sum();
-        sum -= 0.5 * distance2 + log_det + 1.5 * std::f64::consts::TAU.ln();
+        sum += normal_log_density(&error, &at.covariance).ok_or(LearnError::Singular)?;
     }
     Ok(sum / rows.len() as f64)
+}
+
+/// ln N(error; 0, covariance), or `None` if the covariance is singular.
+pub(super) fn normal_log_density(error: &Vector3<f64>, covariance: &Matrix3<f64>) -> Option<f64> {
+    let factor = covariance.cholesky()?;
+    let distance2 = error.dot(&factor.solve(error));
+    let log_det: f64 = (0..3).map(|d| factor.l_dirty()[(d, d)].ln()).sum();
+    Some(-0.5 * distance2 - log_det - 1.5 * std::f64::consts::TAU.ln())
 }

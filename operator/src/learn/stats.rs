@@ -103,14 +103,10 @@ mod tests {
                 } else {
                     0.0
                 };
-                Sample {
+                Sample::at(
                     t_s,
-                    position: Vector3::new(
-                        0.5 * cos + noise() + jump,
-                        0.5 * sin + noise(),
-                        noise(),
-                    ),
-                }
+                    Vector3::new(0.5 * cos + noise() + jump, 0.5 * sin + noise(), noise()),
+                )
             })
             .collect();
         statistics(&[Demonstration::from_samples("circle", &samples).unwrap()])

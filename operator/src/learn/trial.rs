@@ -1,9 +1,12 @@
 //! What a predictor is worth on motion it has not seen: errors collected, calibration drawn from them.
+//! Lengths are metres, or radians where orientation is predicted.
+
+use std::marker::PhantomData;
 
 use nalgebra::{Matrix3, Vector3};
-use telemime_protocol::predict::{Calibration, KNOT_SPACING_S, MAX_KNOTS, Model, Params};
+use telemime_protocol::predict::{Calibration, KNOT_SPACING_S, MAX_KNOTS, Params};
 
-use super::predictor::{displacement, states};
+use super::predictor::Course;
 use super::stats::quantile;
 use crate::demonstration::Demonstration;
 
@@ -42,7 +45,8 @@ impl Slope {
 }
 
 /// The trials of one training.
-pub(super) struct Trial {
+pub(super) struct Trial<C> {
+    course: PhantomData<C>,
     knots: usize,
     damping: f64,
     straight_m2: [f64; MAX_KNOTS],
@@ -53,15 +57,15 @@ pub(super) struct Trial {
     novelties: Vec<f64>,
 }
 
-impl Trial {
+impl<C: Course> Trial<C> {
     /// Tries constant velocity, which needs no training and so nothing held out.
     pub(super) fn straight(demonstrations: &[Demonstration], knots: usize) -> Self {
         let mut moved_m2 = [0.0; MAX_KNOTS];
-        visit(demonstrations, knots, |j, _, truth| {
+        visit::<C>(demonstrations, knots, |j, _, truth| {
             moved_m2[j - 1] += truth.norm_squared();
         });
         let mut damping = Slope::default();
-        visit(demonstrations, knots, |j, straight, truth| {
+        visit::<C>(demonstrations, knots, |j, straight, truth| {
             if CHOSEN_BY.contains(&j) {
                 damping.add(straight, truth, share(&moved_m2, j));
             }
@@ -69,7 +73,7 @@ impl Trial {
         let damping = damping.solve(Params::DEFAULT.cv_damping);
         let mut squared = [0.0; MAX_KNOTS];
         let mut count = [0_u32; MAX_KNOTS];
-        visit(demonstrations, knots, |j, straight, truth| {
+        visit::<C>(demonstrations, knots, |j, straight, truth| {
             squared[j - 1] += (straight * damping - truth).norm_squared();
             count[j - 1] += 1;
         });
@@ -80,6 +84,7 @@ impl Trial {
             }
         }
         Self {
+            course: PhantomData,
             knots,
             damping,
             straight_m2,
@@ -91,18 +96,18 @@ impl Trial {
     }
 
     /// Tries a model on a demonstration it was not trained on.
-    pub(super) fn hold_out(&mut self, model: &Model, d: &Demonstration) {
+    pub(super) fn hold_out(&mut self, model: &C::Model, d: &Demonstration) {
         let end_s = d.last().t_s + 1e-9;
-        for (i, state) in states(d).enumerate() {
-            let p = model.posterior(&state);
+        for (i, state) in C::states(d).iter().enumerate() {
+            let p = C::posterior(model, state);
             self.novelties.push(p.novelty);
-            let velocity = state.motion().0 * self.damping;
+            let velocity = C::velocity(state) * self.damping;
             for j in 1..=self.knots {
                 let h_s = j as f64 * KNOT_SPACING_S;
                 if d.samples()[i].t_s + h_s > end_s {
                     break;
                 }
-                let truth = displacement(d, i, j);
+                let truth = C::displacement(d, i, j);
                 let e = p.displacement[j - 1] - truth;
                 // A planar motion has no variance across its plane.
                 let covariance = p.covariance[j - 1] + Matrix3::identity() * LEAST_M2;
@@ -142,22 +147,22 @@ fn share(moved_m2: &[f64; MAX_KNOTS], j: usize) -> f64 {
     1.0 / moved_m2[j - 1].max(LEAST_M2)
 }
 
-/// Calls `each(knot, undamped constant velocity, truth)`, displacements in m, for every moment and knot.
-fn visit(
+/// Calls `each(knot, undamped constant velocity, truth)` for every moment and knot.
+fn visit<C: Course>(
     demonstrations: &[Demonstration],
     knots: usize,
     mut each: impl FnMut(usize, &Vector3<f64>, &Vector3<f64>),
 ) {
     for d in demonstrations {
         let end_s = d.last().t_s + 1e-9;
-        for (i, state) in states(d).enumerate() {
-            let (velocity, _) = state.motion();
+        for (i, state) in C::states(d).iter().enumerate() {
+            let velocity = C::velocity(state);
             for j in 1..=knots {
                 let h_s = j as f64 * KNOT_SPACING_S;
                 if d.samples()[i].t_s + h_s > end_s {
                     break;
                 }
-                each(j, &(velocity * h_s), &displacement(d, i, j));
+                each(j, &(velocity * h_s), &C::displacement(d, i, j));
             }
         }
     }

@@ -43,7 +43,7 @@ fn perform(gesture: &str, seed: u64, rate_hz: f64) -> (f64, Vec<Sample>) {
         let noise = Vector3::from_fn(|_, _| shake.random_range(-2e-3..2e-3));
         // Smoothstep: from rest to rest.
         let position = at(s * s * (3.0 - 2.0 * s)) + Vector3::new(0.2, -0.3, 2.6) + noise;
-        samples.push(Sample { t_s, position });
+        samples.push(Sample::at(t_s, position));
     }
     (duration_s, samples)
 }

@@ -162,7 +162,7 @@ pub fn run(
     Recogniser::new([], options.recognise)?;
     let phases = sets
         .par_iter()
-        .map(|set| true_phases(set))
+        .map(true_phases)
         .collect::<Result<Vec<_>, _>>()?;
     let performances = Performances { sets, phases };
     let of = rounds.len();

@@ -57,8 +57,25 @@ pub struct HandSample {
     pub t: Stamp,
     /// Position, m.
     pub x: Vector3<f64>,
+    /// Orientation, from the hand's own axes to the tracker's, where the input has it.
+    pub orientation: Option<UnitQuaternion<f64>>,
+    /// How far the gripper is to be open, 0 to 1, where the input says so.
+    pub grip: Option<f64>,
     /// Made up, so that a recording begins at rest: followed like any other, and counted apart.
     pub resting: bool,
+}
+
+impl HandSample {
+    /// A position (m) and nothing else.
+    pub fn at(t: Stamp, x: Vector3<f64>) -> Self {
+        Self {
+            t,
+            x,
+            orientation: None,
+            grip: None,
+            resting: false,
+        }
+    }
 }
 
 /// The largest scale at which the demonstrated motion stays within 0.8 of the arm's speed and

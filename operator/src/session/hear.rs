@@ -3,6 +3,7 @@
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::turn::WireRotation;
 use telemime_protocol::wire::v1::{
     Cause, Drive, Info, Message, OperatorControl, OperatorDatagram, Refusal, RobotControl,
     RobotDatagram, RobotState,
@@ -47,6 +48,8 @@ impl Session {
                 t_us,
                 hand_m,
                 tip_m,
+                hand_q,
+                tip_q,
             } => {
                 self.before = None;
                 self.events.push_back(Event::Engaged {
@@ -54,6 +57,8 @@ impl Session {
                     t_us,
                     hand_m,
                     tip_m,
+                    hand_q: hand_q.map(WireRotation::dequantise),
+                    tip_q: tip_q.dequantise(),
                 });
             }
             RobotControl::Refused { reason } => {

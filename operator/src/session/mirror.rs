@@ -5,17 +5,16 @@ use std::collections::VecDeque;
 use nalgebra::Vector3;
 use telemime_protocol::checkpoint::CheckpointError;
 use telemime_protocol::checkpoint::path::{PathEncoder, PathKnot};
-use telemime_protocol::predict::{Forecast, HandState, Params};
+use telemime_protocol::predict::{HandState, Params, TurnState, checksum};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::knots;
 use telemime_protocol::wire::state::WireState;
-use telemime_protocol::wire::v1::{
-    MAX_TAIL_KNOTS, Motion, PathTail, WireKnot, WireParams, model_tag,
-};
+use telemime_protocol::wire::v1::{Drive, MAX_TAIL_KNOTS, Motion, PathTail, WireKnot, model_tag};
 
 use super::FutureBound;
 use super::adapt::Adaptation;
+use super::hand::{Hand, Known, Travelling};
 
 /// Knots in one message; the oldest unacknowledged first.
 const KNOTS_PER_MESSAGE: usize = 24;
@@ -28,6 +27,15 @@ const KEYFRAME: u32 = 8;
 
 /// A future bound below this makes no sense: the state itself is quantised, m.
 const LEAST_FUTURE_BOUND_M: f64 = 1e-3;
+
+/// The same for orientations, rad.
+const LEAST_FUTURE_BOUND_RAD: f64 = 5e-3;
+
+/// Where the future's bound is a distance, an orientation may be off by this multiple of its deviation.
+const TURN_SIGMAS: f64 = 0.6;
+
+/// A gripper is told of changes above this, in steps of 1/255.
+const GRIP_STEPS: u8 = 4;
 
 /// Every knot travels in this many messages at once, so that a lost packet costs no round trip …
 const COPIES: u8 = 2;
@@ -44,20 +52,21 @@ struct Unacknowledged {
 
 /// A live engagement.
 pub(super) struct Mirror {
-    hand: HandState,
+    hand: Hand,
     path: PathEncoder,
     unacknowledged: VecDeque<Unacknowledged>,
     first_unacknowledged: u32,
-    adaptation: Adaptation,
+    places: Adaptation<HandState>,
+    turns: Adaptation<TurnState>,
     without_model: bool,
-    newest: Option<Forecast>,
-    sent: Option<Forecast>,
+    newest: Option<Known>,
+    sent: Option<Known>,
     messages: u32,
 }
 
 impl Mirror {
     pub(super) fn new(
-        hand: HandState,
+        hand: Hand,
         path_bound_m: f64,
         gain: f64,
         skill: Option<&Skill>,
@@ -69,7 +78,17 @@ impl Mirror {
             path: PathEncoder::new(path_bound_m)?,
             unacknowledged: VecDeque::new(),
             first_unacknowledged: 0,
-            adaptation: Adaptation::new(gain, skill),
+            places: Adaptation::of_places(
+                gain,
+                skill.map(|skill| skill.predictor().calibration().params),
+                skill.map_or(0.0, |skill| skill.stats().reach_m),
+            ),
+            turns: Adaptation::of_turns(
+                gain,
+                skill
+                    .and_then(Skill::turn)
+                    .map(|turn| turn.predictor.model().calibration().params),
+            ),
             without_model: false,
             newest: None,
             sent: None,
@@ -78,13 +97,18 @@ impl Mirror {
     }
 
     /// What an engage request carries.
-    pub(super) fn reference(&self, skill: Option<&Skill>) -> Option<(WireState, u16, WireParams)> {
-        let state = WireState::quantise(&self.hand)?;
-        Some((
+    pub(super) fn reference(&self, skill: Option<&Skill>) -> Option<Drive> {
+        let Travelling {
             state,
-            self.model(skill),
-            WireParams::quantise(&self.adaptation.params(&self.hand)),
-        ))
+            params,
+            pose,
+        } = self.travelling()?;
+        Some(Drive::Mirror {
+            state,
+            model: self.model(skill),
+            params,
+            pose,
+        })
     }
 
     pub(super) fn go_without_model(&mut self) {
@@ -103,18 +127,23 @@ impl Mirror {
     /// Says whether a knot was made.
     pub(super) fn take(
         &mut self,
-        previous: &HandState,
-        hand: HandState,
+        previous: &Hand,
+        hand: Hand,
         skill: Option<&Skill>,
         horizon_s: f64,
     ) -> bool {
         self.hand = hand;
         let skill = skill.filter(|_| !self.without_model);
-        self.adaptation
-            .observe(previous, &hand, skill.map(Skill::predictor), horizon_s);
-        self.newest = self.predict(skill);
+        let model = skill.map(Skill::predictor);
+        self.places
+            .observe(&previous.place, &hand.place, model, horizon_s);
+        if let (Some(previous), Some(turn)) = (&previous.turn, &hand.turn) {
+            let model = skill.and_then(Skill::turn).map(|turn| &turn.predictor);
+            self.turns.observe(previous, turn, model, horizon_s);
+        }
+        self.newest = self.travelling().map(|t| t.known(skill));
         // A sample the path cannot hold (out of the grid's range) is still good for the future.
-        let Ok(Some(knot)) = self.path.push(hand.t, hand.x) else {
+        let Ok(Some(knot)) = self.path.push(hand.place.t, hand.place.x) else {
             return false;
         };
         self.hold(knot);
@@ -125,7 +154,7 @@ impl Mirror {
         self.unacknowledged.push_back(Unacknowledged {
             knot,
             copies: 0,
-            sent: self.hand.t,
+            sent: self.hand.place.t,
         });
     }
 
@@ -148,7 +177,7 @@ impl Mirror {
     /// handed over is forgotten: the stream delivers it as long as the engagement can live at all.
     pub(super) fn tail(&mut self) -> Option<PathTail> {
         // Only an origin is wanted, and one that can travel wherever the hand is.
-        let state = WireState::quantise(&HandState::first(self.hand.t, Vector3::zeros()))?;
+        let state = WireState::quantise(&HandState::first(self.hand.place.t, Vector3::zeros()))?;
         let count = self.unacknowledged.len().min(MAX_TAIL_KNOTS);
         let knots: Vec<_> = self
             .unacknowledged
@@ -172,15 +201,31 @@ impl Mirror {
         let (Some(sent), Some(newest)) = (&self.sent, &self.newest) else {
             return true;
         };
+        let ahead_s = |t: Stamp| arrival.secs_since(t);
         let (held, known) = (
-            sent.at(arrival.secs_since(sent.t)),
-            newest.at(arrival.secs_since(newest.t)),
+            sent.place.at(ahead_s(sent.place.t)),
+            newest.place.at(ahead_s(newest.place.t)),
         );
-        let bound_m = match bound {
-            FutureBound::Absolute(bound_m) => bound_m,
-            FutureBound::Relative(factor) => factor * known.sigma_m,
+        let (bound_m, sigmas) = match bound {
+            FutureBound::Absolute(bound_m) => (bound_m, TURN_SIGMAS),
+            FutureBound::Relative(factor) => (factor * known.sigma_m, factor),
         };
-        (held.position - known.position).norm() > bound_m.max(LEAST_FUTURE_BOUND_M)
+        if (held.position - known.position).norm() > bound_m.max(LEAST_FUTURE_BOUND_M) {
+            return true;
+        }
+        let turned = match (&sent.turn, &newest.turn) {
+            (Some(sent), Some(newest)) => {
+                let (held, known) = (sent.at(ahead_s(sent.t)), newest.at(ahead_s(newest.t)));
+                let bound_rad = (sigmas * known.sigma_rad).max(LEAST_FUTURE_BOUND_RAD);
+                held.orientation.angle_to(&known.orientation) > bound_rad
+            }
+            (sent, newest) => sent.is_some() != newest.is_some(),
+        };
+        let gripped = match (sent.grip, newest.grip) {
+            (Some(sent), Some(newest)) => sent.abs_diff(newest) > GRIP_STEPS,
+            (sent, newest) => sent.is_some() != newest.is_some(),
+        };
+        turned || gripped
     }
 
     /// The next message but for its envelope; `None` if the hand is nowhere that can be sent.
@@ -191,11 +236,15 @@ impl Mirror {
         delay_s: f64,
     ) -> Option<Motion> {
         let skill = skill.filter(|_| !self.without_model);
-        let state = WireState::quantise(&self.hand)?;
-        let params = WireParams::quantise(&self.adaptation.params(&self.hand));
+        let travelling = self.travelling()?;
         self.messages += 1;
-        let forecast = self.predict(skill)?;
-        self.sent = Some(forecast);
+        let known = travelling.known(skill);
+        self.sent = Some(known);
+        let Travelling {
+            state,
+            params,
+            pose,
+        } = travelling;
         let (first_knot, knots) = self.due_knots(&state, now, delay_s);
         Some(Motion {
             epoch: 0,
@@ -204,8 +253,10 @@ impl Mirror {
             lease_ms: 0,
             model: self.model(skill),
             params,
-            checksum: (self.messages % KEYFRAME == 1).then(|| forecast.checksum()),
+            checksum: (self.messages % KEYFRAME == 1)
+                .then(|| checksum(&known.place, known.turn.as_ref())),
             state,
+            pose,
             first_knot,
             knots,
         })
@@ -241,13 +292,12 @@ impl Mirror {
             .map_or(0, |skill| model_tag(&skill.id().0))
     }
 
-    /// What the robot would predict if it were sent the newest state now: from the numbers as they travel.
-    fn predict(&self, skill: Option<&Skill>) -> Option<Forecast> {
-        let state = WireState::quantise(&self.hand)?.dequantise();
-        let params: Params = WireParams::quantise(&self.adaptation.params(&self.hand)).dequantise();
-        Some(match skill {
-            Some(skill) => skill.predictor().forecast(&state, &params),
-            None => Forecast::constant_velocity(&state, &params),
-        })
+    /// The newest of the hand as it would travel now.
+    fn travelling(&self) -> Option<Travelling> {
+        let turn = match &self.hand.turn {
+            Some(turn) => self.turns.params(turn),
+            None => Params::DEFAULT,
+        };
+        Travelling::new(&self.hand, &self.places.params(&self.hand.place), &turn)
     }
 }

@@ -5,6 +5,7 @@
 
 mod adapt;
 mod config;
+mod hand;
 mod hear;
 mod mirror;
 mod said;
@@ -14,8 +15,7 @@ mod tests;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use telemime_protocol::checkpoint::Plan;
-use telemime_protocol::predict::HandState;
+use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::codec;
@@ -26,6 +26,7 @@ use telemime_protocol::wire::v1::{
 pub use config::{FutureBound, HandSample, SessionConfig, default_scale};
 pub use said::{Counters, Event, Output};
 
+use hand::Hand;
 use mirror::Mirror;
 
 /// While an emergency stop is not confirmed, it is repeated at this interval, s.
@@ -53,7 +54,7 @@ pub struct Session {
     model_stored: bool,
     state: RobotState,
     changes: u32,
-    hand: Option<HandState>,
+    hand: Option<Hand>,
     activity: Activity,
     engagement: u32,
     seq: u32,
@@ -144,15 +145,11 @@ impl Session {
     /// The hand, live. Samples out of order or not finite are dropped and counted.
     pub fn handle_sample(&mut self, now: Stamp, sample: HandSample) {
         let Some(hand) = &mut self.hand else {
-            self.hand = sample
-                .x
-                .iter()
-                .all(|v| v.is_finite())
-                .then(|| HandState::first(sample.t, sample.x));
+            self.hand = Hand::first(&sample);
             return;
         };
         let previous = *hand;
-        if !hand.advance(sample.t, sample.x) {
+        if !hand.advance(&sample) {
             self.counters.dropped += 1;
             return;
         }
@@ -200,25 +197,18 @@ impl Session {
             self.events.push_back(Event::Refused(Refusal::BadMapping));
             return;
         };
-        let Some((state, model, params)) = mirror.reference(skill) else {
+        let Some(drive) = mirror.reference(skill) else {
             self.events
                 .push_back(Event::Refused(Refusal::StaleReference));
             return;
         };
         self.activity = Activity::Mirror(Box::new(mirror));
-        self.request(
-            now,
-            Drive::Mirror {
-                state,
-                model,
-                params,
-            },
-        );
+        self.request(now, drive);
         self.last_sent = now;
     }
 
     /// Sends a motion and plays it as soon as the robot has it.
-    pub fn play(&mut self, plan: &Plan<3>) {
+    pub fn play(&mut self, plan: &PosePlan) {
         if self.refuses() {
             return;
         }

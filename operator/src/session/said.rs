@@ -1,5 +1,6 @@
 //! What a session says: bytes to send, events, counts.
 
+use nalgebra::UnitQuaternion;
 use telemime_protocol::wire::v1::{Cause, Refusal, RobotState, Telemetry};
 
 /// What a session wants sent.
@@ -31,6 +32,10 @@ pub enum Event {
         hand_m: [f32; 3],
         /// The tip at that instant, m.
         tip_m: [f32; 3],
+        /// The hand's orientation that corresponds to `tip_q`, where it is followed.
+        hand_q: Option<UnitQuaternion<f64>>,
+        /// The tip's orientation at that instant, to base axes.
+        tip_q: UnitQuaternion<f64>,
     },
     /// A request was declined.
     Refused(Refusal),

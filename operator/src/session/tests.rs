@@ -8,6 +8,7 @@ use telemime_protocol::wire::v1::{ModelId, Motion};
 use telemime_protocol::skill::Stats;
 use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::turn::WireRotation;
 use telemime_protocol::wire::v1::{Cause, RobotControl, RobotDatagram, Telemetry};
 
 use super::*;
@@ -59,6 +60,8 @@ fn telemetry(seq: u32, path_frontier: u32) -> Telemetry {
         tick_p99_ns: 0,
         overruns: 0,
         tip_m: [0.0; 3],
+        tip_q: WireRotation::default(),
+        grip: None,
         q: Vec::new(),
     }
 }
@@ -97,6 +100,8 @@ impl Bench {
             t_us: 0,
             hand_m: [0.0; 3],
             tip_m: [0.0; 3],
+            hand_q: None,
+            tip_q: WireRotation::default(),
         });
         bench.hears(&RobotControl::State {
             state: RobotState::Engaged,
@@ -156,11 +161,7 @@ impl Bench {
     /// Lets 33 ms pass with everything that falls due, then takes a sample.
     fn sample(&mut self, x: Vector3<f64>) {
         self.idle(33);
-        let sample = HandSample {
-            t: self.now,
-            x,
-            resting: false,
-        };
+        let sample = HandSample::at(self.now, x);
         self.session.handle_sample(self.now, sample);
         self.drain();
     }

@@ -1,3 +1,4 @@
+use nalgebra::Vector3;
 use telemime_protocol::checkpoint::select;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::v1::{Info, Message, RobotControl};
@@ -36,7 +37,10 @@ fn points() -> Vec<(f64, Vector3<f64>)> {
 
 fn replay() -> Task {
     Task::replay(Recording {
-        samples: points(),
+        samples: points()
+            .into_iter()
+            .map(|(t_s, x)| Sample::at(t_s, x))
+            .collect(),
         rest_s: 0.0,
     })
 }
@@ -96,6 +100,8 @@ fn after_a_hold_or_a_stop_nothing_is_asked_again() {
             t_us: 0,
             hand_m: [0.0; 3],
             tip_m: [0.0; 3],
+            hand_q: None,
+            tip_q: nalgebra::UnitQuaternion::identity(),
         };
         task.on_event(now, &engaged);
         task.on_event(now, &event);

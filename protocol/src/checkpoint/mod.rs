@@ -7,9 +7,11 @@
 
 pub mod path;
 mod plan;
+mod pose;
 pub mod select;
 
 pub use plan::{Grid, MAX_POINTS, Plan};
+pub use pose::{PoseCurve, PosePlan, PosePlanError, turns};
 
 use nalgebra::SVector;
 

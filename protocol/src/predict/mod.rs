@@ -2,16 +2,21 @@
 //!
 //! [`HandState`] is all that is known of the hand, [`Model`] what was learned, [`Params`] what the
 //! operator adapts; [`Model::forecast`] is a pure function of the three, and keeps nothing.
+//! [`TurnState`], [`TurnModel`] and [`TurnForecast`] are the same for its orientation.
 
+mod ahead;
 mod forecast;
 mod model;
 mod state;
+mod turn;
 
-pub use forecast::{Forecast, Knot, Params, ParamsError, Prediction};
+pub use ahead::{Ahead, Knot, Way};
+pub use forecast::{Forecast, Params, ParamsError, Prediction};
 pub use model::{
     BLOCK, Calibration, Model, ModelError, Posterior, Regression, Standardisation, TARGETS, TEMPER,
 };
 pub use state::{FEATURES, HandState, MEMORY_TAU_S};
+pub use turn::{TurnForecast, TurnModel, TurnPrediction, TurnState, checksum};
 
 /// The most knots a forecast may have beyond the present.
 pub const MAX_KNOTS: usize = 24;

@@ -49,6 +49,14 @@ pub enum ModelError {
     /// A parameter is outside its range.
     #[error(transparent)]
     Params(#[from] ParamsError),
+    /// Not one chart for each component.
+    #[error("{found} charts for {expected} predictor components")]
+    Charts {
+        /// Charts offered.
+        found: usize,
+        /// Components.
+        expected: usize,
+    },
     /// A residual covariance has a negative variance.
     #[error("predictor component {component}: a residual variance is negative")]
     NegativeVariance {
@@ -223,17 +231,27 @@ impl Model {
     /// `l_k = ln π_k − ½‖L_k⁻¹(f−μ_f)‖² − Σ ln diag L_k; r_k ∝ exp(β·l_k); y_k = μ_y + B_kᵀ(f−μ_f);
     /// d = Σ r_k y_k; V = Σ r_k [V_k + (y_k−d)(y_k−d)ᵀ]`
     pub fn posterior(&self, state: &HandState) -> Posterior {
-        let f = (state.features() - self.standardisation.mean)
-            .component_div(&self.standardisation.scale);
+        let features = state.features();
+        self.posterior_of(|_| features)
+    }
+
+    /// The same from the features (m or rad) that each component, by index, is given.
+    pub(super) fn posterior_of(
+        &self,
+        mut features: impl FnMut(usize) -> SVector<f64, FEATURES>,
+    ) -> Posterior {
+        let mut standardised = |k| {
+            (features(k) - self.standardisation.mean).component_div(&self.standardisation.scale)
+        };
         let mut shares = [0.0; MAX_COMPONENTS];
         let shares = &mut shares[..self.components.len()];
         let mut novelty = f64::INFINITY;
-        for ((l, c), log_scale) in shares.iter_mut().zip(&self.components).zip(&self.log_scale) {
-            let mut e = f - c.mean;
+        for (k, (l, c)) in shares.iter_mut().zip(&self.components).enumerate() {
+            let mut e = standardised(k) - c.mean;
             solve_lower(&c.factor, &mut e);
             let d2 = e.norm_squared();
             novelty = novelty.min(d2);
-            *l = TEMPER * (log_scale - 0.5 * d2);
+            *l = TEMPER * (self.log_scale[k] - 0.5 * d2);
         }
         if softmax(shares) == f64::NEG_INFINITY {
             let alike = 1.0 / shares.len() as f64;
@@ -244,14 +262,14 @@ impl Model {
         let mut mean = [0.0; TARGETS];
         let mut spread = [[0.0; BLOCK]; MAX_KNOTS];
         let mut total = 0.0;
-        for (&r, c) in shares.iter().zip(&self.components) {
+        for (k, (&r, c)) in shares.iter().zip(&self.components).enumerate() {
             if r < NEGLIGIBLE {
                 continue;
             }
             total += r;
             let share = r / total;
             let mut delta = c.target;
-            let e = f - c.mean;
+            let e = standardised(k) - c.mean;
             for (row, e) in c.gain.iter().zip(e.iter()) {
                 for (y, b) in delta.iter_mut().zip(row) {
                     *y += b * e;

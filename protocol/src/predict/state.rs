@@ -46,10 +46,8 @@ impl HandState {
         if t <= self.t || !x.iter().all(|v| v.is_finite()) {
             return false;
         }
-        let dt_s = t.secs_since(self.t).max(LEAST_STEP_S);
         for (m, tau_s) in self.memory.iter_mut().zip(MEMORY_TAU_S) {
-            let e = libm::exp(-dt_s / tau_s);
-            let q = (1.0 - e) * tau_s / dt_s;
+            let (e, q) = blend(t.secs_since(self.t), tau_s);
             *m = *m * e + x * (1.0 - q) + self.x * (q - e);
         }
         self.t = t;
@@ -74,6 +72,13 @@ impl HandState {
             .chain(self.memory.iter().flatten())
             .all(|v| v.is_finite())
     }
+}
+
+/// What a step of `dt_s` leaves of a memory of time constant `tau_s`: `e = exp(−dt/τ)`, and `q = (1−e)·τ/dt`.
+pub(super) fn blend(dt_s: f64, tau_s: f64) -> (f64, f64) {
+    let dt_s = dt_s.max(LEAST_STEP_S);
+    let e = libm::exp(-dt_s / tau_s);
+    (e, (1.0 - e) * tau_s / dt_s)
 }
 
 #[cfg(test)]

@@ -1,15 +1,16 @@
 //! The encoding of a skill, and its parse: raw numbers come in, a checked [`Skill`] goes out.
 
-use nalgebra::{SMatrix, SVector};
+use nalgebra::{Quaternion, SMatrix, SVector, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Gmm, MAX_DURATION_S, MAX_NAME_BYTES, MAX_SKILL_BYTES, MAX_SOURCES, Provenance, Skill,
-    SkillError, SkillId, Stats, sha256,
+    Gmm, GmmError, MAX_DURATION_S, MAX_NAME_BYTES, MAX_SKILL_BYTES, MAX_SOURCES, Pace, Parts,
+    Placement, Provenance, Samples, Skill, SkillError, SkillId, Stats, TaskFrame, TaskModel, Turn,
+    TurnError, TurnMixture, sha256,
 };
 use crate::predict::{
     BLOCK, Calibration, FEATURES, MAX_KNOTS, Model, ModelError, Params, Regression,
-    Standardisation, TARGETS,
+    Standardisation, TARGETS, TurnModel,
 };
 use crate::wire::codec::{self, DecodeError};
 
@@ -20,10 +21,49 @@ const TRIANGLE: usize = FEATURES * (FEATURES + 1) / 2;
 struct RawSkill {
     name: String,
     duration_s: f64,
+    pace: Pace,
     motion: Vec<RawGaussian>,
     predictor: RawModel,
+    turn: Option<RawTurn>,
+    grip: Option<Vec<RawOpening>>,
+    task: Option<Vec<RawFrame>>,
     stats: Stats,
+    samples: Samples,
     provenance: Provenance,
+}
+
+/// Orientations as (w, x, y, z).
+#[derive(Serialize, Deserialize)]
+struct RawTurn {
+    motion: Vec<RawTurned>,
+    predictor: RawModel,
+    /// One a component of the predictor.
+    charts: Vec<[f32; 4]>,
+}
+
+/// A Gaussian over (t, rotation vector) about (`t_s`, `chart`); the covariance as of [`RawGaussian`].
+#[derive(Serialize, Deserialize)]
+struct RawTurned {
+    weight: f64,
+    t_s: f64,
+    chart: [f64; 4],
+    covariance: [f64; 10],
+}
+
+/// A Gaussian over (t, opening).
+#[derive(Serialize, Deserialize)]
+struct RawOpening {
+    weight: f64,
+    mean: [f64; 2],
+    covariance: [f64; 3],
+}
+
+#[derive(Serialize, Deserialize)]
+struct RawFrame {
+    name: String,
+    origin: [f64; 3],
+    turn: [f64; 4],
+    motion: Vec<RawGaussian>,
 }
 
 /// The covariance as its lower triangle, row by row.
@@ -59,37 +99,34 @@ struct RawRegression {
     residual: Vec<f32>,
 }
 
-pub(super) fn encode(
-    name: String,
-    motion: &Gmm<4>,
-    duration_s: f64,
-    predictor: &Model,
-    stats: Stats,
-    provenance: Provenance,
-) -> Vec<u8> {
-    let motion = motion
-        .components()
-        .iter()
-        .map(|c| RawGaussian {
-            weight: c.weight(),
-            mean: (*c.mean()).into(),
-            covariance: {
-                let mut packed = [0.0; 10];
-                packed
-                    .iter_mut()
-                    .zip(triangle(4))
-                    .for_each(|(v, at)| *v = c.covariance()[at]);
-                packed
-            },
-        })
-        .collect();
+pub(super) fn encode(parts: Parts) -> Vec<u8> {
     codec::encode(&RawSkill {
-        name,
-        duration_s,
-        motion,
-        predictor: pack(predictor),
-        stats,
-        provenance,
+        name: parts.name,
+        duration_s: parts.duration_s,
+        pace: parts.pace,
+        motion: gaussians(&parts.motion),
+        predictor: pack(&parts.predictor),
+        turn: parts.turn.as_ref().map(pack_turn),
+        grip: parts.grip.as_ref().map(|grip| {
+            let opening = |c: &super::Component<2>| RawOpening {
+                weight: c.weight(),
+                mean: (*c.mean()).into(),
+                covariance: packed(c.covariance()),
+            };
+            grip.components().iter().map(opening).collect()
+        }),
+        task: parts.task.as_ref().map(|task| {
+            let frame = |f: &TaskFrame| RawFrame {
+                name: f.name.clone(),
+                origin: f.usual.origin.into(),
+                turn: raw_quaternion(&f.usual.turn),
+                motion: gaussians(&f.motion),
+            };
+            task.frames().iter().map(frame).collect()
+        }),
+        stats: parts.stats,
+        samples: parts.samples,
+        provenance: parts.provenance,
     })
 }
 
@@ -105,28 +142,165 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Skill, SkillError> {
             seconds: raw.duration_s,
         });
     }
+    check_pace(&raw.pace)?;
     check_stats(&raw.stats)?;
-    check_provenance(&raw.provenance)?;
-    let motion = Gmm::new(raw.motion.iter().map(|g| {
-        let mut covariance = SMatrix::zeros();
-        for (&v, (i, j)) in g.covariance.iter().zip(triangle(4)) {
-            covariance[(i, j)] = v;
-            covariance[(j, i)] = v;
+    for (field, count) in [
+        ("motion", raw.samples.motion),
+        ("predictor", raw.samples.predictor),
+    ] {
+        if count == 0 {
+            return Err(SkillError::Samples { field });
         }
-        (g.weight, SVector::from(g.mean), covariance)
-    }))?;
+    }
+    check_provenance(&raw.provenance)?;
+    let grip = raw.grip.map(|grip| {
+        Gmm::new(
+            grip.iter()
+                .map(|g| (g.weight, SVector::from(g.mean), unpacked(&g.covariance))),
+        )
+    });
+    let frame = |f: RawFrame| -> Result<_, SkillError> {
+        let origin = SVector::from(f.origin);
+        if !origin.iter().all(|v: &f64| v.is_finite()) {
+            return Err(GmmError::NotFinite { component: 0 }.into());
+        }
+        Ok(TaskFrame {
+            name: f.name,
+            motion: mixture(&f.motion)?,
+            usual: Placement {
+                origin,
+                turn: quaternion(f.turn, 0)?,
+            },
+        })
+    };
+    let frames = raw
+        .task
+        .map(|task| task.into_iter().map(frame).collect::<Result<_, _>>());
     let mut id = [0; 16];
     id.copy_from_slice(&sha256(bytes)[..16]);
-    Ok(Skill {
+    let parts = Parts {
         name: raw.name,
-        motion,
+        motion: mixture(&raw.motion)?,
         duration_s: raw.duration_s,
+        pace: raw.pace,
         predictor: unpack(&raw.predictor)?,
+        turn: raw.turn.as_ref().map(unpack_turn).transpose()?,
+        grip: grip.transpose()?,
+        task: frames.transpose()?.map(TaskModel::new).transpose()?,
         stats: raw.stats,
+        samples: raw.samples,
         provenance: raw.provenance,
+    };
+    Ok(Skill {
+        parts,
         id: SkillId(id),
         bytes: bytes.to_vec(),
     })
+}
+
+fn gaussians(gmm: &Gmm<4>) -> Vec<RawGaussian> {
+    let raw = |c: &super::Component<4>| RawGaussian {
+        weight: c.weight(),
+        mean: (*c.mean()).into(),
+        covariance: packed(c.covariance()),
+    };
+    gmm.components().iter().map(raw).collect()
+}
+
+fn mixture(raw: &[RawGaussian]) -> Result<Gmm<4>, GmmError> {
+    Gmm::new(
+        raw.iter()
+            .map(|g| (g.weight, SVector::from(g.mean), unpacked(&g.covariance))),
+    )
+}
+
+/// The lower triangle, row by row.
+fn packed<const D: usize, const N: usize>(covariance: &SMatrix<f64, D, D>) -> [f64; N] {
+    let mut packed = [0.0; N];
+    packed
+        .iter_mut()
+        .zip(triangle(D))
+        .for_each(|(v, at)| *v = covariance[at]);
+    packed
+}
+
+fn unpacked<const D: usize, const N: usize>(packed: &[f64; N]) -> SMatrix<f64, D, D> {
+    let mut covariance = SMatrix::zeros();
+    for (&v, (i, j)) in packed.iter().zip(triangle(D)) {
+        covariance[(i, j)] = v;
+        covariance[(j, i)] = v;
+    }
+    covariance
+}
+
+fn raw_quaternion(q: &UnitQuaternion<f64>) -> [f64; 4] {
+    [q.w, q.i, q.j, q.k]
+}
+
+/// Kept as it is: normalising again would change the last bits, and encoding what was decoded gives the same bytes.
+fn quaternion([w, x, y, z]: [f64; 4], component: usize) -> Result<UnitQuaternion<f64>, TurnError> {
+    let q = Quaternion::new(w, x, y, z);
+    // Written so that NaN fails too.
+    if !((q.norm_squared() - 1.0).abs() < 1e-6) {
+        return Err(TurnError::NotARotation { component });
+    }
+    Ok(UnitQuaternion::new_unchecked(q))
+}
+
+fn pack_turn(turn: &Turn) -> RawTurn {
+    let components = turn.motion.gmm().components();
+    RawTurn {
+        motion: components
+            .iter()
+            .zip(turn.motion.charts())
+            .map(|(c, chart)| RawTurned {
+                weight: c.weight(),
+                t_s: c.mean()[0],
+                chart: raw_quaternion(chart),
+                covariance: packed(c.covariance()),
+            })
+            .collect(),
+        predictor: pack(turn.predictor.model()),
+        charts: turn
+            .predictor
+            .charts()
+            .iter()
+            .map(|q| raw_quaternion(q).map(|v| v as f32))
+            .collect(),
+    }
+}
+
+fn unpack_turn(raw: &RawTurn) -> Result<Turn, SkillError> {
+    let gmm = Gmm::new(raw.motion.iter().map(|g| {
+        let mean = SVector::from([g.t_s, 0.0, 0.0, 0.0]);
+        (g.weight, mean, unpacked(&g.covariance))
+    }))?;
+    let charts = raw
+        .motion
+        .iter()
+        .enumerate()
+        .map(|(component, g)| quaternion(g.chart, component))
+        .collect::<Result<_, _>>()?;
+    let predictor_charts = raw
+        .charts
+        .iter()
+        .enumerate()
+        .map(|(component, q)| quaternion(q.map(f64::from), component))
+        .collect::<Result<_, _>>()?;
+    Ok(Turn {
+        motion: TurnMixture::new(gmm, charts)?,
+        predictor: TurnModel::new(unpack(&raw.predictor)?, predictor_charts)?,
+    })
+}
+
+fn check_pace(pace: &Pace) -> Result<(), SkillError> {
+    if !pace.mean_ln_s.is_finite() {
+        return Err(SkillError::Pace { field: "mean" });
+    }
+    if !(pace.deviation_ln > 0.0 && pace.deviation_ln.is_finite()) {
+        return Err(SkillError::Pace { field: "deviation" });
+    }
+    Ok(())
 }
 
 fn check_stats(stats: &Stats) -> Result<(), SkillError> {

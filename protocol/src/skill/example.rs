@@ -2,9 +2,13 @@
 
 use nalgebra::{SMatrix, SVector, Vector3, Vector4};
 
-use super::{Gmm, Provenance, Skill, Source, Stats};
+use super::{
+    Gmm, Pace, Parts, Placement, Provenance, Samples, Skill, Source, Stats, TaskFrame, TaskModel,
+    Turn, TurnMixture,
+};
+use crate::pose;
 use crate::predict::{
-    BLOCK, Calibration, FEATURES, MAX_KNOTS, Model, Regression, Standardisation, TARGETS,
+    BLOCK, Calibration, FEATURES, MAX_KNOTS, Model, Regression, Standardisation, TARGETS, TurnModel,
 };
 
 /// A skill of `k` components whose predictor has `knots` knots: valid, repeatable, and learned from nothing.
@@ -12,9 +16,52 @@ use crate::predict::{
 /// # Panics
 /// For counts that no skill may have.
 pub fn example(k: usize, knots: usize) -> Skill {
-    Skill::new(
-        "wave".to_owned(),
-        &Gmm::new((0..k).map(|i| {
+    Skill::new(example_parts(k, knots)).expect("a valid example")
+}
+
+/// [`example`] with orientation, a gripper and two frames.
+///
+/// # Panics
+/// For counts that no skill may have.
+pub fn posed_example(k: usize, knots: usize) -> Skill {
+    let parts = example_parts(k, knots);
+    let charts: Vec<_> = (0..k)
+        .map(|i| pose::exp(&Vector3::new(0.3 * i as f64, -1.0, 0.5)))
+        .collect();
+    let turned = Gmm::new(parts.motion.components().iter().map(|c| {
+        let mean = Vector4::new(c.mean()[0], 0.0, 0.0, 0.0);
+        (c.weight(), mean, *c.covariance())
+    }))
+    .expect("a valid example");
+    let frame = |name: &str, x: f64| TaskFrame {
+        name: name.to_owned(),
+        motion: parts.motion.clone(),
+        usual: Placement {
+            origin: Vector3::new(x, 0.5, 0.25),
+            turn: pose::exp(&Vector3::new(0.0, 0.0, x)),
+        },
+    };
+    Skill::new(Parts {
+        turn: Some(Turn {
+            motion: TurnMixture::new(turned, charts.clone()).expect("a valid example"),
+            predictor: TurnModel::new(parts.predictor.clone(), charts).expect("a valid example"),
+        }),
+        grip: Some(
+            Gmm::new([(1.0, SVector::from([1.0, 0.5]), SMatrix::identity() * 0.25)])
+                .expect("a valid example"),
+        ),
+        task: Some(
+            TaskModel::new(vec![frame("start", 0.0), frame("goal", 1.0)]).expect("a valid example"),
+        ),
+        ..parts.clone()
+    })
+    .expect("a valid example")
+}
+
+fn example_parts(k: usize, knots: usize) -> Parts {
+    Parts {
+        name: "wave".to_owned(),
+        motion: Gmm::new((0..k).map(|i| {
             let u = i as f64;
             let mean = Vector4::new(u, 0.1 * u, 1.0 - u, 0.3);
             (
@@ -24,16 +71,27 @@ pub fn example(k: usize, knots: usize) -> Skill {
             )
         }))
         .expect("a valid example"),
-        2.5,
-        &example_model(k, knots),
-        Stats {
+        duration_s: 2.5,
+        pace: Pace {
+            mean_ln_s: 0.9,
+            deviation_ln: 0.125,
+        },
+        predictor: example_model(k, knots),
+        turn: None,
+        grip: None,
+        task: None,
+        stats: Stats {
             speed95_m_s: 4.0,
             acceleration95_m_s2: 60.0,
             reach_m: 0.9,
             min: Vector3::new(-1.0, 0.0, 2.0),
             max: Vector3::new(1.0, 1.5, 3.0),
         },
-        Provenance {
+        samples: Samples {
+            motion: 100,
+            predictor: 90,
+        },
+        provenance: Provenance {
             producer: "a test".to_owned(),
             seed: 7,
             sources: vec![Source {
@@ -41,8 +99,7 @@ pub fn example(k: usize, knots: usize) -> Skill {
                 sha256: [9; 32],
             }],
         },
-    )
-    .expect("a valid example")
+    }
 }
 
 pub(super) fn example_model(k: usize, knots: usize) -> Model {

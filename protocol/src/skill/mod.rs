@@ -6,6 +6,8 @@ mod example;
 mod file;
 pub(crate) mod gmm;
 mod gmr;
+mod task;
+mod turn;
 
 use core::fmt;
 
@@ -13,14 +15,16 @@ use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::predict::{Model, ModelError};
+use crate::predict::{Model, ModelError, TurnModel};
 use crate::wire::codec::DecodeError;
 
 #[cfg(any(test, feature = "testing"))]
-pub use example::example;
+pub use example::{example, posed_example};
 pub use file::FileError;
 pub use gmm::{Component, Gmm, GmmError, MAX_COMPONENTS};
 pub use gmr::{Gmr, GmrError, Regressed};
+pub use task::{MAX_FRAMES, Placement, TaskError, TaskFrame, TaskModel};
+pub use turn::{RegressedTurn, TurnError, TurnMixture};
 
 /// The most bytes an encoded skill may have.
 pub const MAX_SKILL_BYTES: usize = 512 * 1024;
@@ -65,6 +69,34 @@ pub struct Stats {
     pub max: Vector3<f64>,
 }
 
+/// How long performances take: durations are log-normal, since a performance half as long is as likely as
+/// one twice as long.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Pace {
+    /// Mean of the logarithm of the duration in seconds.
+    pub mean_ln_s: f64,
+    /// Its standard deviation, > 0.
+    pub deviation_ln: f64,
+}
+
+/// How much a skill has seen, so that a further demonstration weighs what it should.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Samples {
+    /// Rows the motion's mixture was fitted to, ≥ 1.
+    pub motion: u32,
+    /// Rows the predictor was trained on, ≥ 1.
+    pub predictor: u32,
+}
+
+/// Orientation, where the demonstrations have it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Turn {
+    /// What to play: a mixture over time and orientation.
+    pub motion: TurnMixture,
+    /// What to mirror with.
+    pub predictor: TurnModel,
+}
+
 /// One demonstration a skill was learned from.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Source {
@@ -97,6 +129,24 @@ pub enum SkillError {
     /// The predictor is not one.
     #[error(transparent)]
     Predictor(#[from] ModelError),
+    /// The orientation's mixture is not one.
+    #[error("orientation: {0}")]
+    Turn(#[from] TurnError),
+    /// The frames are not a motion.
+    #[error(transparent)]
+    Task(#[from] TaskError),
+    /// The durations' distribution is not one.
+    #[error("pace: {field} is not usable")]
+    Pace {
+        /// Which number.
+        field: &'static str,
+    },
+    /// It was learned from nothing.
+    #[error("samples: none for the {field}")]
+    Samples {
+        /// Of what.
+        field: &'static str,
+    },
     /// The name is empty or too long.
     #[error("a name of {bytes} bytes, 1 to {MAX_NAME_BYTES} are allowed")]
     Name {
@@ -123,36 +173,49 @@ pub enum SkillError {
     },
 }
 
+/// What a skill is made of.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Parts {
+    /// Its name, 1 to [`MAX_NAME_BYTES`] bytes.
+    pub name: String,
+    /// The motion to play: a mixture over (t s, x m, y m, z m), t from 0 to `duration_s`.
+    pub motion: Gmm<4>,
+    /// How long the motion takes as played, s, at most [`MAX_DURATION_S`].
+    pub duration_s: f64,
+    /// How long it took to perform.
+    pub pace: Pace,
+    /// The predictor to mirror with.
+    pub predictor: Model,
+    /// Orientation, where demonstrated.
+    pub turn: Option<Turn>,
+    /// The gripper to play, where demonstrated: a mixture over (t s, opening 0 to 1).
+    pub grip: Option<Gmm<2>>,
+    /// The motion relative to frames, where it was learned so.
+    pub task: Option<TaskModel>,
+    /// How the demonstrations moved.
+    pub stats: Stats,
+    /// How much was seen of them.
+    pub samples: Samples,
+    /// Where the skill came from.
+    pub provenance: Provenance,
+}
+
 /// A learned skill. It exists only in the form its encoding gives it: a predictor's numbers are
 /// rounded to `f32` on construction, so that whoever learned it runs what everybody else runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Skill {
-    name: String,
-    motion: Gmm<4>,
-    duration_s: f64,
-    predictor: Model,
-    stats: Stats,
-    provenance: Provenance,
+    parts: Parts,
     id: SkillId,
     bytes: Vec<u8>,
 }
 
 impl Skill {
-    /// Checks, encodes and decodes a skill. `motion` is over (t s, x m, y m, z m), t from 0 to `duration_s`.
+    /// Checks, encodes and decodes a skill.
     ///
     /// # Errors
     /// [`SkillError`], one variant a cause.
-    pub fn new(
-        name: String,
-        motion: &Gmm<4>,
-        duration_s: f64,
-        predictor: &Model,
-        stats: Stats,
-        provenance: Provenance,
-    ) -> Result<Self, SkillError> {
-        Self::from_bytes(&bytes::encode(
-            name, motion, duration_s, predictor, stats, provenance,
-        ))
+    pub fn new(parts: Parts) -> Result<Self, SkillError> {
+        Self::from_bytes(&bytes::encode(parts))
     }
 
     /// Decodes and checks a skill of at most [`MAX_SKILL_BYTES`].
@@ -173,39 +236,68 @@ impl Skill {
         self.id
     }
 
+    /// All it is made of.
+    pub fn parts(&self) -> &Parts {
+        &self.parts
+    }
+
     /// Its name, 1 to [`MAX_NAME_BYTES`] bytes.
     pub fn name(&self) -> &str {
-        &self.name
+        &self.parts.name
     }
 
     /// The motion to play: a mixture over (t s, x m, y m, z m).
     pub fn motion(&self) -> &Gmm<4> {
-        &self.motion
+        &self.parts.motion
     }
 
-    /// How long the motion takes, s.
+    /// How long the motion takes as played, s.
     pub fn duration_s(&self) -> f64 {
-        self.duration_s
+        self.parts.duration_s
+    }
+
+    /// How long it took to perform.
+    pub fn pace(&self) -> &Pace {
+        &self.parts.pace
     }
 
     /// The predictor to mirror with.
     pub fn predictor(&self) -> &Model {
-        &self.predictor
+        &self.parts.predictor
+    }
+
+    /// Orientation, where demonstrated.
+    pub fn turn(&self) -> Option<&Turn> {
+        self.parts.turn.as_ref()
+    }
+
+    /// The gripper to play, where demonstrated.
+    pub fn grip(&self) -> Option<&Gmm<2>> {
+        self.parts.grip.as_ref()
+    }
+
+    /// The motion relative to frames, where it was learned so.
+    pub fn task(&self) -> Option<&TaskModel> {
+        self.parts.task.as_ref()
     }
 
     /// How the demonstrations moved.
     pub fn stats(&self) -> &Stats {
-        &self.stats
+        &self.parts.stats
     }
 
     /// Where the skill came from.
     pub fn provenance(&self) -> &Provenance {
-        &self.provenance
+        &self.parts.provenance
     }
 
     /// Whether a recording with this SHA-256 was trained on.
     pub fn was_trained_on(&self, sha256: &[u8; 32]) -> bool {
-        self.provenance.sources.iter().any(|s| s.sha256 == *sha256)
+        self.parts
+            .provenance
+            .sources
+            .iter()
+            .any(|s| s.sha256 == *sha256)
     }
 }
 

@@ -1,7 +1,7 @@
 use nalgebra::{SMatrix, SVector};
 use proptest::prelude::*;
 
-use super::example::{example, example_model};
+use super::example::{example, example_model, posed_example};
 use super::*;
 use crate::predict::{Calibration, Regression, Standardisation};
 
@@ -13,15 +13,15 @@ fn a_skill_is_what_its_bytes_say() {
         assert_eq!(again, skill);
         assert!(skill.to_bytes().len() <= MAX_SKILL_BYTES);
         assert_eq!(skill.predictor().knots(), knots);
-        let rebuilt = Skill::new(
-            skill.name().to_owned(),
-            skill.motion(),
-            skill.duration_s(),
-            skill.predictor(),
-            *skill.stats(),
-            skill.provenance().clone(),
-        );
-        assert_eq!(rebuilt.unwrap().id(), skill.id());
+        assert_eq!(Skill::new(skill.parts().clone()).unwrap().id(), skill.id());
+    }
+    for (k, knots) in [(1, 1), (14, 24)] {
+        let skill = posed_example(k, knots);
+        assert_eq!(Skill::from_bytes(skill.to_bytes()).unwrap(), skill);
+        let parts = skill.parts();
+        assert!(parts.turn.is_some() && parts.grip.is_some() && parts.task.is_some());
+        // What was rounded once is not rounded again.
+        assert_eq!(Skill::new(parts.clone()).unwrap(), skill);
     }
     let skill = example(2, 2);
     assert!(skill.was_trained_on(&[9; 32]) && !skill.was_trained_on(&[8; 32]));
@@ -68,14 +68,13 @@ fn a_file_states_version_and_units_and_shows_damage() {
 fn every_field_is_checked_on_parse() {
     let good = example(2, 2);
     let build = |name: &str, duration_s: f64, stats: Stats, provenance: Provenance| {
-        Skill::new(
-            name.to_owned(),
-            good.motion(),
+        Skill::new(Parts {
+            name: name.to_owned(),
             duration_s,
-            good.predictor(),
             stats,
             provenance,
-        )
+            ..good.parts().clone()
+        })
         .unwrap_err()
     };
     let (stats, origin) = (*good.stats(), good.provenance().clone());

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::codec::{self, DecodeError};
 use super::frame::MAX_FRAME_LEN;
 use super::state::WireState;
+use super::turn::{WirePose, WireRotation};
 use crate::predict::Params;
 
 /// The version this module speaks.
@@ -56,7 +57,7 @@ pub enum OperatorControl {
     Plan {
         /// Names the plan in `Engage`.
         id: u32,
-        /// `checkpoint::Plan` in its encoding.
+        /// `checkpoint::PosePlan` in its encoding.
         bytes: Vec<u8>,
     },
     /// Asks for motion. The robot takes its reference at the instant it engages.
@@ -109,6 +110,8 @@ pub enum Drive {
         model: u16,
         /// As in [`Motion::params`].
         params: WireParams,
+        /// As in [`Motion::pose`].
+        pose: WirePose,
     },
     /// A plan sent before.
     Play {
@@ -142,6 +145,10 @@ pub enum RobotControl {
         hand_m: [f32; 3],
         /// The tip's position then, m in base axes.
         tip_m: [f32; 3],
+        /// The hand's orientation that corresponds to the tip's, where it is followed.
+        hand_q: Option<WireRotation>,
+        /// The tip's orientation then, to base axes.
+        tip_q: WireRotation,
     },
     /// A request is declined.
     Refused {
@@ -300,10 +307,12 @@ pub struct Motion {
     pub model: u16,
     /// Parameters to predict with.
     pub params: WireParams,
-    /// Checksum of the operator's own prediction from `state`, in keyframes.
+    /// Checksum of the operator's own prediction from `state` and `pose`, in keyframes.
     pub checksum: Option<u32>,
     /// The newest hand state.
     pub state: WireState,
+    /// The newest orientation and gripper, as far as the input has them.
+    pub pose: WirePose,
     /// Number of the first of `knots` in the engagement's path.
     pub first_knot: u32,
     /// Unacknowledged knots of the path in order, the oldest first.
@@ -419,6 +428,10 @@ pub struct Telemetry {
     pub overruns: u32,
     /// Tip, m in base axes.
     pub tip_m: [f32; 3],
+    /// The tip's orientation, to base axes.
+    pub tip_q: WireRotation,
+    /// How far the gripper is open, in steps of 1/255, if there is one.
+    pub grip: Option<u8>,
     /// Joint positions, rad or m.
     pub q: Vec<f32>,
 }
@@ -491,7 +504,10 @@ impl OperatorControl {
                 )?;
                 require(engage.path_bound_um > 0, "engage.path_bound_um", "zero")?;
                 match &engage.drive {
-                    Drive::Mirror { state, .. } => state.check(),
+                    Drive::Mirror { state, pose, .. } => {
+                        state.check()?;
+                        pose.check()
+                    }
                     Drive::Play { .. } => Ok(()),
                 }
             }
@@ -527,8 +543,16 @@ impl RobotControl {
                     "outside 0 to 2 s",
                 )
             }
-            Self::Engaged { hand_m, tip_m, .. } => {
-                require(finite(hand_m) && finite(tip_m), "engaged", "not finite")
+            Self::Engaged {
+                hand_m,
+                tip_m,
+                hand_q,
+                tip_q,
+                ..
+            } => {
+                require(finite(hand_m) && finite(tip_m), "engaged", "not finite")?;
+                hand_q.map_or(Ok(()), |q| q.check("engaged.hand_q"))?;
+                tip_q.check("engaged.tip_q")
             }
             Self::ModelStored { .. }
             | Self::PlanStored { .. }
@@ -547,7 +571,8 @@ impl OperatorDatagram {
                     "motion.knots",
                     "more than 32",
                 )?;
-                motion.state.check()
+                motion.state.check()?;
+                motion.pose.check()
             }
             Self::Go { .. } | Self::Pong { .. } | Self::Stop { .. } => Ok(()),
         }
@@ -568,7 +593,8 @@ impl RobotDatagram {
                     finite(&telemetry.q) && finite(&telemetry.tip_m),
                     "telemetry",
                     "not finite",
-                )
+                )?;
+                telemetry.tip_q.check("telemetry.tip_q")
             }
         }
     }

@@ -1,18 +1,22 @@
-//! One tick from a demanded tip position to torques.
+//! One tick from a demanded tip position and orientation to torques.
 
 use std::sync::Arc;
 
-use nalgebra::Vector3;
+use nalgebra::{UnitQuaternion, Vector3};
 use telemime_sim::arm::{ArmModel, Joints, PlantError, check_start};
 
-use super::ik::DifferentialIk;
+use super::ik::{DifferentialIk, quaternion};
+use super::turn::checked;
 use super::{
     CartesianLimits, ComputedTorque, FilterConfig, FilterError, FilterState, IkConfig,
-    LimitedFilter, joint_accelerations,
+    LimitedFilter, TurnFilter, TurnLimits, TurnState, joint_accelerations,
 };
 
 /// The filter's reference may lead the joints' reference by this much, m; beyond, the arm cannot follow and the filter waits for it.
 const LEASH_M: f64 = 0.002;
+
+/// The same for the orientation, rad. Longer: what an arm with too few axes lacks must not hold up the rest.
+const LEASH_RAD: f64 = 0.05;
 
 /// Bandwidth, limits and gains of a [`Controller`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -21,9 +25,11 @@ pub struct ControlConfig {
     pub omega: f64,
     /// Largest tip speed, acceleration and jerk; lowered to what the arm allows ([`CartesianLimits::lowered`]).
     pub limits: CartesianLimits,
+    /// Largest speed, acceleration and jerk of the tip's rotation; lowered to what the arm allows ([`TurnLimits::lowered`]).
+    pub turn_limits: TurnLimits,
     /// Bandwidth of the joints' torque control, rad/s.
     pub joint_bandwidth: f64,
-    /// How fast the tip's orientation returns to that at the last reset, 1/s.
+    /// How fast an error of the tip's orientation is closed, 1/s: against the one followed, or else the one at the last reset.
     pub orientation_gain: f64,
     /// How fast idle joints return to the start posture, 1/s.
     pub posture_gain: f64,
@@ -41,6 +47,11 @@ impl Default for ControlConfig {
                 a_max: 13.0,
                 j_max: 6500.0,
             },
+            turn_limits: TurnLimits {
+                v_max: 2.5,
+                a_max: 25.0,
+                j_max: 12_500.0,
+            },
             joint_bandwidth: 80.0,
             orientation_gain: 8.0,
             posture_gain: 1.0,
@@ -55,6 +66,9 @@ pub enum ControlError {
     /// The filter's configuration is impossible.
     #[error(transparent)]
     Filter(#[from] FilterError),
+    /// The limits of turning are impossible.
+    #[error("limits of the tip's rotation, in rad instead of m: {0}")]
+    Turn(#[source] FilterError),
     /// A gain that is not a positive number.
     #[error("{what} is {value}; it must be a positive number, and small against 1/dt")]
     Gain {
@@ -88,10 +102,12 @@ pub enum ControlError {
 /// What the tip is to do.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Demand {
-    /// Be at `target` 3/ω from now.
+    /// Be at `target`, and in `orientation` as far as the arm can be at once, 3/ω from now.
     Follow {
         /// Tip position in the base frame, m.
         target: Vector3<f64>,
+        /// Tip axes to base axes; `None` keeps the orientation there is.
+        orientation: Option<UnitQuaternion<f64>>,
         /// Share of the speed that is allowed, 0 to 1.
         speed_scale: f64,
     },
@@ -104,13 +120,17 @@ pub enum Demand {
 pub struct Clamps {
     /// The filter was at a limit of speed, acceleration or jerk.
     pub filter: bool,
+    /// The orientation's filter was at a limit of angular speed, acceleration or jerk, or the joints' step that turns the tip was slowed to theirs.
+    pub turning: bool,
     /// The joints' step was slowed to the speed or acceleration limits of the joints or the tip.
     pub slowed: bool,
     /// The arm is near a singular posture.
     pub singular: bool,
     /// The filter's reference was held back because the arm cannot follow.
     pub held_back: bool,
-    /// The demand or the measured state was not finite: stopped, or controlled by the reference.
+    /// The same for its orientation.
+    pub turn_held_back: bool,
+    /// The demand or the measured state was not finite, or its orientation not a unit quaternion: stopped, or controlled by the reference.
     pub invalid: bool,
     /// Joints held back by their end of range.
     pub at_limit: u16,
@@ -125,12 +145,16 @@ pub struct ClampCounts {
     pub ticks: u64,
     /// See [`Clamps::filter`].
     pub filter: u64,
+    /// See [`Clamps::turning`].
+    pub turning: u64,
     /// See [`Clamps::slowed`].
     pub slowed: u64,
     /// See [`Clamps::singular`].
     pub singular: u64,
     /// See [`Clamps::held_back`].
     pub held_back: u64,
+    /// See [`Clamps::turn_held_back`].
+    pub turn_held_back: u64,
     /// See [`Clamps::invalid`].
     pub invalid: u64,
     /// Ticks with any joint of [`Clamps::at_limit`].
@@ -143,9 +167,11 @@ impl ClampCounts {
     fn add(&mut self, clamps: &Clamps) {
         self.ticks += 1;
         self.filter += u64::from(clamps.filter);
+        self.turning += u64::from(clamps.turning);
         self.slowed += u64::from(clamps.slowed);
         self.singular += u64::from(clamps.singular);
         self.held_back += u64::from(clamps.held_back);
+        self.turn_held_back += u64::from(clamps.turn_held_back);
         self.invalid += u64::from(clamps.invalid);
         self.at_limit += u64::from(clamps.at_limit != 0);
         self.torque += u64::from(clamps.torque != 0);
@@ -159,8 +185,14 @@ pub struct Output {
     pub tau: Joints,
     /// The filter's output at this tick.
     pub reference: FilterState,
+    /// The orientation filter's output at this tick.
+    pub turn: TurnState,
     /// Where the measured joints put the tip, m.
     pub tip: Vector3<f64>,
+    /// How they orient it: tip axes to base axes.
+    pub orientation: UnitQuaternion<f64>,
+    /// The angle from there to the orientation demanded, or to the one being kept, rad: of a demand that turns, what is due only 3/ω later is part of it.
+    pub orientation_error_rad: f64,
     /// The joints' reference at this tick, rad or m.
     pub q_ref: Joints,
     /// What was clamped.
@@ -172,7 +204,11 @@ pub struct Output {
 pub struct Controller {
     arm: Arc<ArmModel>,
     limits: CartesianLimits,
+    turn_limits: TurnLimits,
     filter: LimitedFilter,
+    turn: TurnFilter,
+    /// An orientation has been demanded since the last reset.
+    turns: bool,
     ik: DifferentialIk,
     torque: ComputedTorque,
     counts: ClampCounts,
@@ -201,11 +237,14 @@ impl Controller {
         let mut q = Joints::zeros();
         q.as_mut_slice()[..arm.dof()].copy_from_slice(&q0.as_slice()[..arm.dof()]);
         let limits = config.limits.lowered(&arm, &q, config.dt_s)?;
+        let turn_limits = config.turn_limits.lowered(&arm, &q, config.dt_s)?;
         let accelerations = joint_accelerations(&arm, &q)?;
         let ik_config = IkConfig {
             position_gain: 0.1 / config.dt_s,
             v_max: limits.v_max,
             a_max: limits.a_max,
+            turn_v_max: turn_limits.v_max,
+            turn_a_max: turn_limits.a_max,
             orientation_gain: config.orientation_gain,
             posture_gain: config.posture_gain,
             dt_s: config.dt_s,
@@ -219,10 +258,20 @@ impl Controller {
             dt_s: config.dt_s,
         };
         let filter = LimitedFilter::new(filter_config, ik.reset(&q))?;
+        let turn_config = FilterConfig {
+            v_max: turn_limits.v_max,
+            a_max: turn_limits.a_max,
+            j_max: turn_limits.j_max,
+            ..filter_config
+        };
+        let turn = TurnFilter::new(turn_config, ik.orientation()).map_err(ControlError::Turn)?;
         Ok(Self {
             arm,
             limits,
+            turn_limits,
             filter,
+            turn,
+            turns: false,
             ik,
             torque: ComputedTorque::new(config.joint_bandwidth),
             counts: ClampCounts::default(),
@@ -234,7 +283,12 @@ impl Controller {
         &self.limits
     }
 
-    /// The time by which the tip lags its demand, 3/ω, s.
+    /// The limits of the tip's rotation in force.
+    pub fn turn_limits(&self) -> &TurnLimits {
+        &self.turn_limits
+    }
+
+    /// The time by which the tip lags its demand in position and orientation, 3/ω, s.
     pub fn lag_s(&self) -> f64 {
         3.0 / self.filter.config().omega
     }
@@ -249,7 +303,12 @@ impl Controller {
         self.filter.state()
     }
 
-    /// Starts afresh, at rest at the measured joints `q`; the tip's orientation there is kept from now on. Returns the tip's place, m.
+    /// Where the orientation filter's output is.
+    pub fn turn_reference(&self) -> TurnState {
+        self.turn.state()
+    }
+
+    /// Starts afresh, at rest at the measured joints `q`; the tip's orientation there is kept until another is demanded. Returns the tip's place, m.
     /// Joints that are not finite leave the reference where it is, at rest.
     pub fn reset_reference(&mut self, q: &Joints) -> Vector3<f64> {
         let q = if q.iter().all(|x| x.is_finite()) {
@@ -259,30 +318,24 @@ impl Controller {
         };
         let tip = self.ik.reset(&q);
         self.filter.reset(tip);
+        self.turn.reset(self.ik.orientation());
+        self.turns = false;
         tip
     }
 
     /// One tick at the measured `q` (rad, m) and `qd` (rad/s, m/s).
     pub fn tick(&mut self, demand: Demand, q: &Joints, qd: &Joints) -> Output {
         let now = (*self.filter.state(), *self.ik.reference());
+        let turn_now = self.turn.state();
         let mut clamps = Clamps::default();
-        let moving = match demand {
-            Demand::Follow {
-                target,
-                speed_scale,
-            } => {
-                clamps.invalid = !(target.iter().all(|x| x.is_finite()) && speed_scale.is_finite());
-                clamps.filter = self.filter.follow(target, speed_scale);
-                !clamps.invalid && speed_scale > 0.0
-            }
-            Demand::Stop => {
-                clamps.filter = self.filter.stop();
-                false
-            }
-        };
+        let (moving, demanded) = self.filtered(demand, &mut clamps);
         let FilterState { p, v, .. } = *self.filter.state();
-        let step = self.ik.step(&p, &v, moving);
+        let turn = self.turns.then(|| self.turn.state());
+        // A turn that has begun is braked by its filter, not let go.
+        let secondary = moving || !self.turn.at_rest();
+        let step = self.ik.step(&p, &v, turn.as_ref(), secondary);
         clamps.slowed = step.slowed;
+        clamps.turning |= step.turn_slowed;
         clamps.singular = step.singular;
         clamps.at_limit = step.at_limit;
         let lead = step.error_m.norm();
@@ -290,6 +343,12 @@ impl Controller {
             let back = step.error_m * (LEASH_M / lead - 1.0);
             self.filter.hold_back(back, step.tip_velocity);
             clamps.held_back = true;
+        }
+        let lead = step.turn_error_rad.norm();
+        if self.turns && lead > LEASH_RAD {
+            let back = step.turn_error_rad * (LEASH_RAD / lead - 1.0);
+            self.turn.hold_back(back, step.angular_velocity);
+            clamps.turn_held_back = true;
         }
 
         let (reference, mut joints) = now;
@@ -304,12 +363,53 @@ impl Controller {
         let (tau, cut) = self.torque.torque(&self.arm, &joints, q, qd);
         clamps.torque = cut;
         self.counts.add(&clamps);
+        let kinematics = self.torque.dynamics().kinematics();
+        let orientation = quaternion(kinematics.tip_rotation());
+        let asked = demanded.unwrap_or(self.turn.state().orientation);
         Output {
             tau,
             reference,
-            tip: self.torque.dynamics().kinematics().tip(),
+            turn: turn_now,
+            tip: kinematics.tip(),
+            orientation,
+            orientation_error_rad: orientation.angle_to(&asked),
             q_ref: joints.q,
             clamps,
         }
+    }
+
+    /// Both filters' tick. Returns whether the tip is to go anywhere, and the orientation demanded.
+    fn filtered(
+        &mut self,
+        demand: Demand,
+        clamps: &mut Clamps,
+    ) -> (bool, Option<UnitQuaternion<f64>>) {
+        let Demand::Follow {
+            target,
+            orientation,
+            speed_scale,
+        } = demand
+        else {
+            clamps.filter = self.filter.stop();
+            clamps.turning = self.turn.stop();
+            return (false, None);
+        };
+        let unit = orientation.as_ref().and_then(checked);
+        clamps.invalid = !(target.iter().all(|x| x.is_finite()) && speed_scale.is_finite())
+            || orientation.is_some() != unit.is_some();
+        if clamps.invalid {
+            clamps.filter = self.filter.stop();
+            clamps.turning = self.turn.stop();
+            return (false, None);
+        }
+        clamps.filter = self.filter.follow(target, speed_scale);
+        clamps.turning = match unit {
+            Some(unit) => {
+                self.turns = true;
+                self.turn.follow(unit, speed_scale)
+            }
+            None => self.turn.stop(),
+        };
+        (speed_scale > 0.0, unit)
     }
 }

@@ -141,6 +141,11 @@ impl LimitedFilter {
         }
     }
 
+    /// Makes the output the origin, velocity and acceleration unchanged; returns where it was.
+    pub(super) fn recentre(&mut self) -> Vector3<f64> {
+        core::mem::take(&mut self.state.p)
+    }
+
     /// One tick towards `target`, m. `speed_scale` ∈ [0, 1] multiplies the commanded velocity: 0 fades to a stop.
     /// Returns whether a limit was active. A target or scale that is not finite stops instead.
     pub fn follow(&mut self, target: Vector3<f64>, speed_scale: f64) -> bool {

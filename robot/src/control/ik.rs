@@ -2,16 +2,20 @@
 
 use std::sync::Arc;
 
-use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Rotation3, SMatrix, SymmetricEigen, UnitQuaternion, Vector3};
 use telemime_sim::arm::{ArmModel, Jacobian, Joints, Kinematics, MAX_JOINTS};
 
 use super::filter::limited;
+use super::turn::{TurnState, rotation_between};
 
 /// How many times a step is resolved again without the joints that are at the end of their range.
 const MAX_DROPPED: usize = 3;
 
 /// What the tip may accelerate by beyond the filter's limit, as a share of it: without it a lag that arises under full acceleration would stay.
 const RESERVE: f64 = 0.04;
+
+/// Below this the freedom to turn about an axis without moving the tip counts as near-singular, rad/rad.
+const TURN_SINGULAR_BELOW: f64 = 0.2;
 
 type Rows = SMatrix<f64, 3, MAX_JOINTS>;
 
@@ -24,6 +28,10 @@ pub struct IkConfig {
     pub v_max: f64,
     /// Largest acceleration of the reference's tip, m/s², but for a 25th that is kept to close position errors.
     pub a_max: f64,
+    /// Largest angular speed of the reference's tip while an orientation is followed, rad/s.
+    pub turn_v_max: f64,
+    /// Largest angular acceleration likewise, rad/s², but for a 25th that is kept to close errors.
+    pub turn_a_max: f64,
     /// How fast an orientation error is closed where the arm has joints to spare for it, 1/s.
     pub orientation_gain: f64,
     /// How fast the remaining freedom returns to the rest posture, 1/s.
@@ -48,6 +56,8 @@ pub struct JointReference {
 pub struct JointStep {
     /// The step was slowed along its path to keep the joints or the tip within their limits of speed and acceleration.
     pub slowed: bool,
+    /// The motions that do not move the tip were slowed likewise while an orientation was followed.
+    pub turn_slowed: bool,
     /// The tip is near a singular posture: motion is damped.
     pub singular: bool,
     /// Joints held back by their end of range.
@@ -56,12 +66,18 @@ pub struct JointStep {
     pub error_m: Vector3<f64>,
     /// Velocity of the reference's tip when the step ends, m/s.
     pub tip_velocity: Vector3<f64>,
+    /// The rotation that takes the reference's orientation to where it is to be, base axes, rad.
+    pub turn_error_rad: Vector3<f64>,
+    /// Angular velocity of the reference's tip when the step ends, rad/s.
+    pub angular_velocity: Vector3<f64>,
 }
 
 /// Velocity resolution by task priority: position first, orientation in its null space, posture in both.
 pub(super) struct Resolved {
     pub(super) primary: Joints,
     pub(super) secondary: Joints,
+    /// What of `secondary` is the posture's, the rest being the orientation's.
+    pub(super) idle: Joints,
     /// Smallest singular value of the position Jacobian, m/rad.
     pub(super) sigma_min: f64,
 }
@@ -76,6 +92,44 @@ pub(super) fn resolve(
     posture_velocity: &Joints,
     epsilon: f64,
 ) -> Resolved {
+    // 0.2 rad/rad: an arm of five axes never has a free rotation about every axis, and what it lacks must not be bought dearly.
+    let calm = |gram: &Matrix3<f64>| damped_inverse(gram, 0.2 * 0.2);
+    resolve_by(
+        jacobian,
+        tip_velocity,
+        angular_velocity,
+        posture_velocity,
+        epsilon,
+        calm,
+    )
+}
+
+/// As [`resolve`], with the orientation followed as exactly as the arm's freedom allows.
+fn resolve_turning(
+    jacobian: &Jacobian,
+    tip_velocity: &Vector3<f64>,
+    angular_velocity: &Vector3<f64>,
+    posture_velocity: &Joints,
+    epsilon: f64,
+) -> Resolved {
+    resolve_by(
+        jacobian,
+        tip_velocity,
+        angular_velocity,
+        posture_velocity,
+        epsilon,
+        selective_inverse,
+    )
+}
+
+fn resolve_by(
+    jacobian: &Jacobian,
+    tip_velocity: &Vector3<f64>,
+    angular_velocity: &Vector3<f64>,
+    posture_velocity: &Joints,
+    epsilon: f64,
+    invert_freed: impl Fn(&Matrix3<f64>) -> Matrix3<f64>,
+) -> Resolved {
     let linear: Rows = jacobian.fixed_rows::<3>(0).into();
     let angular: Rows = jacobian.fixed_rows::<3>(3).into();
     let gram = linear * linear.transpose();
@@ -88,14 +142,14 @@ pub(super) fn resolve(
     let inverse = damped_inverse(&gram, damping);
     let primary = linear.transpose() * (inverse * tip_velocity);
     let freed = angular - (angular * linear.transpose()) * inverse * linear;
-    // 0.2 rad/rad: an arm of five axes never has a free rotation about every axis, and what it lacks must not be bought dearly.
-    let inverse_freed = damped_inverse(&(freed * freed.transpose()), 0.2 * 0.2);
+    let inverse_freed = invert_freed(&(freed * freed.transpose()));
     let left_over = angular_velocity - angular * primary;
     let idle = posture_velocity - linear.transpose() * (inverse * (linear * posture_velocity));
     let secondary = idle + freed.transpose() * (inverse_freed * (left_over - freed * idle));
     Resolved {
         primary,
         secondary,
+        idle: idle - freed.transpose() * (inverse_freed * (freed * idle)),
         sigma_min,
     }
 }
@@ -104,6 +158,36 @@ fn damped_inverse(gram: &Matrix3<f64>, damping: f64) -> Matrix3<f64> {
     (gram + Matrix3::from_diagonal_element(damping))
         .try_inverse()
         .unwrap_or_else(Matrix3::zeros)
+}
+
+/// The inverse of `gram` axis by axis, damped only about those that the arm can hardly turn about (Maciejewski & Klein 1988): an arm of five axes
+/// lacks one, and follows the others no worse for it.
+fn selective_inverse(gram: &Matrix3<f64>) -> Matrix3<f64> {
+    let Some(eigen) = SymmetricEigen::try_new(*gram, f64::EPSILON, 60) else {
+        return damped_inverse(gram, TURN_SINGULAR_BELOW * TURN_SINGULAR_BELOW);
+    };
+    let most = TURN_SINGULAR_BELOW * TURN_SINGULAR_BELOW;
+    let inverse = eigen.eigenvalues.map(|square| {
+        let square = square.max(0.0);
+        1.0 / (square + 0.25 * (most - square).max(0.0))
+    });
+    eigen.eigenvectors * Matrix3::from_diagonal(&inverse) * eigen.eigenvectors.transpose()
+}
+
+/// The joint speeds (columns) that turn the tip about each base axis at 1 rad/s without moving it, as far as the arm can.
+pub(super) fn turning_rates(jacobian: &Jacobian) -> SMatrix<f64, MAX_JOINTS, 3> {
+    let (zero, none) = (Vector3::zeros(), Joints::zeros());
+    let column = |axis: Vector3<f64>| resolve_turning(jacobian, &zero, &axis, &none, 0.0).secondary;
+    SMatrix::from_columns(&[
+        column(Vector3::x()),
+        column(Vector3::y()),
+        column(Vector3::z()),
+    ])
+}
+
+/// The rotation `axes` (columns: tip axes in base axes) as a quaternion.
+pub(super) fn quaternion(axes: &Matrix3<f64>) -> UnitQuaternion<f64> {
+    UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(*axes))
 }
 
 /// Smallest eigenvalue of a symmetric matrix (Smith 1961).
@@ -146,8 +230,12 @@ pub(super) struct DifferentialIk {
     /// Share of the secondary tasks, faded so that stopping and starting them is no jolt.
     secondary_share: f64,
     reference: JointReference,
+    /// Share of an orientation that is followed: whole at once, since its filter begins at rest, and faded when all stops.
+    turn_share: f64,
     /// Of the reference's tip, m/s.
     tip_velocity: Vector3<f64>,
+    /// The same, rad/s.
+    angular_velocity: Vector3<f64>,
     kinematics: Kinematics,
 }
 
@@ -166,12 +254,14 @@ impl DifferentialIk {
             rest: *q,
             orientation: Matrix3::identity(),
             secondary_share: 0.0,
+            turn_share: 0.0,
             reference: JointReference {
                 q: *q,
                 qd: Joints::zeros(),
                 qdd: Joints::zeros(),
             },
             tip_velocity: Vector3::zeros(),
+            angular_velocity: Vector3::zeros(),
             kinematics: Kinematics::new(),
         };
         ik.reset(q);
@@ -186,7 +276,9 @@ impl DifferentialIk {
             qdd: Joints::zeros(),
         };
         self.secondary_share = 0.0;
+        self.turn_share = 0.0;
         self.tip_velocity = Vector3::zeros();
+        self.angular_velocity = Vector3::zeros();
         self.kinematics.update(&self.arm, q);
         self.orientation = *self.kinematics.tip_rotation();
         self.kinematics.tip()
@@ -196,12 +288,18 @@ impl DifferentialIk {
         &self.reference
     }
 
-    /// One tick: the reference moves so that the tip is at `p` with velocity `v` when the tick ends.
-    /// `secondary` allows the motions that do not move the tip.
+    /// The orientation at the last reset.
+    pub(super) fn orientation(&self) -> UnitQuaternion<f64> {
+        quaternion(&self.orientation)
+    }
+
+    /// One tick: the reference moves so that the tip is at `p` with velocity `v` when the tick ends, and as far as that leaves it free, oriented and
+    /// turning as `turn` says; without it, towards the orientation at the last reset. `secondary` allows the motions that do not move the tip.
     pub(super) fn step(
         &mut self,
         p: &Vector3<f64>,
         v: &Vector3<f64>,
+        turn: Option<&TurnState>,
         secondary: bool,
     ) -> JointStep {
         let h = self.config.dt_s;
@@ -209,15 +307,23 @@ impl DifferentialIk {
         let ahead = q + qd * h;
         self.kinematics.update(&self.arm, &ahead);
         let error_m = p - self.kinematics.tip();
-        let turn = orientation_error(self.kinematics.tip_rotation(), &self.orientation);
+        let at = self.kinematics.tip_rotation();
+        let turn_error_rad = match turn {
+            None => orientation_error(at, &self.orientation),
+            Some(turn) => rotation_between(&quaternion(at), &turn.orientation),
+        };
         let mut jacobian = self.kinematics.jacobian();
         let linear: Rows = jacobian.fixed_rows::<3>(0).into();
+        let angular: Rows = jacobian.fixed_rows::<3>(3).into();
         let (tip_velocity, held) = self.tip_command(v, &error_m);
-        let angular_velocity = turn * self.config.orientation_gain;
+        let (angular_velocity, by_priority): (_, fn(&_, &_, &_, &_, f64) -> Resolved) = match turn {
+            None => (turn_error_rad * self.config.orientation_gain, resolve),
+            Some(turn) => (self.turn_command(turn, &turn_error_rad), resolve_turning),
+        };
         let idle = (self.rest - ahead) * self.config.posture_gain;
         let epsilon = singular_below(&self.arm);
         let (lower, upper) = self.speed_window(&ahead);
-        let mut resolved = resolve(&jacobian, &tip_velocity, &angular_velocity, &idle, epsilon);
+        let mut resolved = by_priority(&jacobian, &tip_velocity, &angular_velocity, &idle, epsilon);
         let sigma_min = resolved.sigma_min;
         let mut at_limit = 0;
         // A joint at its end does not hold up the others: they take the motion over as far as they can (as in Flacco et al. 2015).
@@ -230,21 +336,32 @@ impl DifferentialIk {
             for i in (0..self.arm.dof()).filter(|i| blocked >> i & 1 == 1) {
                 jacobian.column_mut(i).fill(0.0);
             }
-            resolved = resolve(&jacobian, &tip_velocity, &angular_velocity, &idle, epsilon);
+            resolved = by_priority(&jacobian, &tip_velocity, &angular_velocity, &idle, epsilon);
         }
         let towards = if secondary { 1.0 } else { 0.0 };
         let fade = 10.0 * h;
         self.secondary_share += (towards - self.secondary_share).clamp(-fade, fade);
+        self.turn_share = (self.turn_share - fade).max(towards);
 
-        let primary_share = largest_share(&Joints::zeros(), &resolved.primary, &lower, &upper);
+        let none = Joints::zeros();
+        let primary_share = largest_share(&none, &resolved.primary, &lower, &upper);
         let primary = resolved.primary * primary_share;
-        let secondary = resolved.secondary * self.secondary_share;
-        let wanted = primary + secondary * largest_share(&primary, &secondary, &lower, &upper);
+        // An orientation that is followed comes before the posture; one that is merely kept shares with it.
+        let (secondary, last) = match turn {
+            None => (resolved.secondary * self.secondary_share, none),
+            Some(_) => (
+                (resolved.secondary - resolved.idle) * self.turn_share,
+                resolved.idle * self.secondary_share,
+            ),
+        };
+        let secondary_fits = largest_share(&primary, &secondary, &lower, &upper);
+        let mut wanted = primary + secondary * secondary_fits;
+        wanted += last * largest_share(&wanted, &last, &lower, &upper);
         let most = self.accelerations * h;
         let change = wanted - qd;
         // What moves the tip comes first: turning about it must not take the joint acceleration that braking needs.
         let moved = jacobian.fixed_rows::<3>(0) * qd;
-        let (none, still) = (Joints::zeros(), Vector3::zeros());
+        let still = Vector3::zeros();
         let asked = tip_velocity * primary_share - moved;
         let first = resolve(&jacobian, &asked, &still, &none, epsilon).primary;
         let coasting = linear * qd - self.tip_velocity;
@@ -256,11 +373,20 @@ impl DifferentialIk {
         ));
         let first = first * change_share;
         let rest = change - first;
-        let rest_share = largest_share(&first, &rest, &-most, &most).min(share_within(
+        let mut rest_share = largest_share(&first, &rest, &-most, &most).min(share_within(
             &(coasting + linear * first),
             &(linear * rest),
             most_tip,
         ));
+        if turn.is_some() {
+            let coasting = angular * (qd + first) - self.angular_velocity;
+            let most_turn = (1.0 + RESERVE) * self.config.turn_a_max * h * (1.0 + 1e-9);
+            // Where the tip's way alone turns it harder, the rest must be free to brake.
+            if coasting.norm() < most_turn {
+                let share = share_within(&coasting, &(angular * rest), most_turn);
+                rest_share = rest_share.min(share);
+            }
+        }
         let mut next = qd + first + rest * rest_share;
         for i in 0..self.arm.dof() {
             // Slowing all joints alike for one joint's acceleration must not keep another from braking before its stop.
@@ -277,6 +403,7 @@ impl DifferentialIk {
             }
         }
         self.tip_velocity = linear * next;
+        self.angular_velocity = angular * next;
         self.reference = JointReference {
             q: q_next,
             qd: next,
@@ -288,6 +415,9 @@ impl DifferentialIk {
             at_limit,
             error_m,
             tip_velocity: self.tip_velocity,
+            turn_slowed: turn.is_some() && (secondary_fits < 1.0 || rest_share < 1.0),
+            turn_error_rad,
+            angular_velocity: self.angular_velocity,
         }
     }
 
@@ -307,6 +437,19 @@ impl DifferentialIk {
         let most = (1.0 + RESERVE) * a_max * dt_s;
         let (change, hard) = limited(wanted - self.tip_velocity, most);
         (self.tip_velocity + change, fast || hard)
+    }
+
+    /// The tip's next angular velocity: the filter's and what closes the orientation error, within the limit of speed.
+    fn turn_command(&self, turn: &TurnState, error_rad: &Vector3<f64>) -> Vector3<f64> {
+        let IkConfig {
+            orientation_gain,
+            turn_v_max,
+            turn_a_max,
+            ..
+        } = self.config;
+        let closing = (2.0 * RESERVE * turn_a_max * error_rad.norm()).sqrt();
+        let (correction, _) = limited(error_rad * orientation_gain, closing);
+        limited(turn.angular_velocity + correction, turn_v_max).0
     }
 
     /// Joints (bits) that `motion` would press against the end of their range.

@@ -1,4 +1,4 @@
-//! From a demanded tip position to joint torques: a limited filter, differential inverse kinematics, computed torque.
+//! From a demanded tip position, and an orientation if there is one, to joint torques: limited filters, differential inverse kinematics, computed torque.
 //!
 //! Nothing here allocates after construction: every vector has a fixed size and every workspace is a field. Nothing here
 //! reads a clock: a tick is `dt_s` long.
@@ -8,6 +8,7 @@ mod filter;
 mod ik;
 mod posture;
 mod torque;
+mod turn;
 
 #[cfg(test)]
 mod tests;
@@ -19,3 +20,4 @@ pub use filter::{FilterConfig, FilterError, FilterState, LimitedFilter};
 pub use ik::{IkConfig, JointReference, JointStep};
 pub use posture::{CartesianLimits, home_posture, joint_accelerations, workspace_radius};
 pub use torque::ComputedTorque;
+pub use turn::{TurnFilter, TurnLimits, TurnState};

@@ -9,7 +9,7 @@ use super::ControlError;
 use super::ik::{largest_share, min_eigenvalue, orientation_error, resolve};
 
 /// No joint reference accelerates faster, rad/s² (m/s²), whatever its motor could do with it alone: joints load each other.
-const ACCELERATION_CAP: f64 = 30.0;
+pub(super) const ACCELERATION_CAP: f64 = 30.0;
 
 /// Speed, acceleration and jerk of the tip that every direction allows at a posture.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -53,16 +53,20 @@ impl CartesianLimits {
                 .min(joint.acceleration.min(ACCELERATION_CAP) / rate)
                 .min(headroom[i] / torques.row(i).norm());
         }
-        // a²/j + a·dt = 0.8·v, solved for a.
-        let j = limits.j_max;
-        let turned = 0.5 * j * ((dt_s * dt_s + 3.2 * limits.v_max / j).sqrt() - dt_s);
-        limits.a_max = limits.a_max.min(turned);
+        limits.a_max = limits
+            .a_max
+            .min(turned_around(limits.v_max, limits.j_max, dt_s));
         Ok(limits)
     }
 }
 
+/// The acceleration that the jerk `j` can turn around, in ticks of `dt_s`, within 0.8 of the speed `v`: a²/j + a·dt = 0.8·v, solved for a.
+pub(super) fn turned_around(v: f64, j: f64, dt_s: f64) -> f64 {
+    0.5 * j * ((dt_s * dt_s + 3.2 * v / j).sqrt() - dt_s)
+}
+
 /// What 0.8 of each effort limit leaves beside gravity and friction.
-fn headroom(arm: &ArmModel, dynamics: &mut Dynamics) -> Result<Joints, ControlError> {
+pub(super) fn headroom(arm: &ArmModel, dynamics: &mut Dynamics) -> Result<Joints, ControlError> {
     let zero = Joints::zeros();
     let gravity = dynamics.rnea(&zero, &zero);
     let mut out = Joints::zeros();

@@ -2,13 +2,12 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
-use telemime_protocol::predict::Forecast;
-use telemime_protocol::spline::BSpline;
-use telemime_protocol::wire::v1::{Cause, RobotState};
-use telemime_sim::arm::{Joints, Plant, PlantReport};
+use telemime_protocol::predict::{Forecast, TurnForecast};
+use telemime_protocol::wire::v1::Cause;
+use telemime_sim::arm::{Gripper, Plant, PlantReport};
 
-use super::brake::Brake;
 use super::mapping::{Mapping, Workspace};
+use super::orders::{Engagement, Order, Report, Rings, Source, Ticket, Trajectory};
 use crate::control::{Clamps, Controller, Demand};
 use crate::safety::{Safety, SafetyConfig};
 
@@ -17,6 +16,9 @@ pub const RAMP_S: f64 = 0.5;
 
 /// Below this tip speed the arm counts as still, m/s.
 const STILL_M_S: f64 = 1e-3;
+
+/// Above this speed of turning it does not, rad/s.
+const STILL_TURN_RAD_S: f64 = 1e-2;
 
 /// Above this joint speed it does not, wherever its reference is, rad/s or m/s.
 const STILL_RAD_S: f64 = 0.01;
@@ -28,140 +30,6 @@ const SETTLE_S: f64 = 0.3;
 pub fn ramp(u: f64) -> f64 {
     let u = u.clamp(0.0, 1.0);
     u * u * (3.0 - 2.0 * u)
-}
-
-/// A motion to play: hand position in m over time in s from 0.
-#[derive(Debug)]
-pub struct Trajectory {
-    /// Position over time.
-    pub spline: BSpline<3>,
-    /// Its end, s.
-    pub duration_s: f64,
-}
-
-/// What drives an engagement.
-#[derive(Debug)]
-#[expect(
-    clippy::large_enum_variant,
-    reason = "a box would be allocated per message and freed on the tick"
-)]
-pub enum Source {
-    /// The hand, live: a forecast and when its state was valid on the robot's clock.
-    Mirror {
-        /// The prediction to start from.
-        forecast: Forecast,
-        /// When its newest sample was valid.
-        valid_at: Mono,
-    },
-    /// A plan, from its beginning.
-    Play(Box<Trajectory>),
-}
-
-/// Which engagement of which session.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Ticket {
-    /// The session's epoch, unique for the life of the daemon; 0 is none.
-    pub epoch: u32,
-    /// The engagement's number within the session.
-    pub number: u32,
-}
-
-/// How long a message authorises motion, on the robot's clock and fixed when it arrived: what waits in a
-/// queue does not last longer for it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Lease {
-    /// When it arrived.
-    pub from: Mono,
-    /// When it ends.
-    pub until: Mono,
-}
-
-/// A granted request to engage.
-#[derive(Debug)]
-pub struct Engagement {
-    /// Whose it is.
-    pub ticket: Ticket,
-    /// What drives.
-    pub source: Source,
-    /// Tip metres per hand metre.
-    pub scale: f64,
-    /// Hand axes to base axes.
-    pub rotation: UnitQuaternion<f64>,
-    /// First lease.
-    pub lease: Lease,
-}
-
-/// What the session tells the servo. Stops are not among it: a [`Brake`] needs no queue.
-#[derive(Debug)]
-pub enum Order {
-    /// An operator has, or loses, authority.
-    Operator(bool),
-    /// Follow.
-    Engage(Engagement),
-    /// Newest prediction, and the lease that came with it.
-    Track {
-        /// For which engagement.
-        ticket: Ticket,
-        /// The prediction.
-        forecast: Forecast,
-        /// When its newest sample was valid.
-        valid_at: Mono,
-        /// For how long.
-        lease: Lease,
-    },
-    /// Play goes on.
-    Extend {
-        /// For which engagement.
-        ticket: Ticket,
-        /// For how long.
-        lease: Lease,
-    },
-    /// The clutch is let go.
-    Release(Ticket),
-    /// Leave the latched stop.
-    Reset {
-        /// Whether an operator has authority.
-        operator: bool,
-        /// The stop that is meant, by [`Report::transitions`]; `None` is whoever stands at the arm.
-        stop: Option<u32>,
-    },
-}
-
-/// What the servo tells the session after every tick.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Report {
-    /// Counts ticks.
-    pub tick: u64,
-    /// When the tick began.
-    pub at: Mono,
-    /// State after it.
-    pub state: RobotState,
-    /// Why.
-    pub cause: Cause,
-    /// Counts state changes.
-    pub transitions: u32,
-    /// The engagement followed last; that of epoch 0 before the first.
-    pub engagement: Ticket,
-    /// When it began.
-    pub engaged_at: Mono,
-    /// The engagement declined last: the arm had begun to move, or a stop came first.
-    pub declined: Ticket,
-    /// Its mapping.
-    pub mapping: Mapping,
-    /// The arm still moves.
-    pub moving: bool,
-    /// Age of the newest hand state, s.
-    pub age_s: f64,
-    /// Where the tip is asked to go, m.
-    pub target_m: Vector3<f64>,
-    /// Where the filter has it, m.
-    pub reference_m: Vector3<f64>,
-    /// Tip, m.
-    pub tip_m: Vector3<f64>,
-    /// Joint positions.
-    pub q: Joints,
-    /// Ticks of this engagement on which a limit acted.
-    pub clamps: u32,
 }
 
 /// What the core is set to.
@@ -177,60 +45,18 @@ pub struct CoreConfig {
     pub workspace: Workspace,
 }
 
-/// The servo's ends of the rings.
-#[derive(Debug)]
-pub struct Rings {
-    /// Orders from the session.
-    pub orders: rtrb::Consumer<Order>,
-    /// Reports to the session; dropped (and seen by their tick numbers) while it is full.
-    pub reports: rtrb::Producer<Report>,
-    /// Trajectories no longer needed, to be freed elsewhere.
-    pub spent: rtrb::Producer<Box<Trajectory>>,
-    /// Stops.
-    pub brake: Brake,
-}
-
-/// The session's ends of the rings.
-#[derive(Debug)]
-pub struct Handle {
-    /// Orders to the servo.
-    pub orders: rtrb::Producer<Order>,
-    /// Reports from it.
-    pub reports: rtrb::Consumer<Report>,
-    /// Trajectories to free.
-    pub spent: rtrb::Consumer<Box<Trajectory>>,
-    /// Stops.
-    pub brake: Brake,
-}
-
-/// A pair of ring ends: 64 orders, 4096 reports (four seconds).
-pub fn rings() -> (Rings, Handle) {
-    let (order_in, orders) = rtrb::RingBuffer::new(64);
-    let (reports, report_out) = rtrb::RingBuffer::new(4096);
-    let (spent, spent_out) = rtrb::RingBuffer::new(64);
-    let brake = Brake::default();
-    let servo = Rings {
-        orders,
-        reports,
-        spent,
-        brake: brake.clone(),
-    };
-    let session = Handle {
-        orders: order_in,
-        reports: report_out,
-        spent: spent_out,
-        brake,
-    };
-    (servo, session)
-}
-
 #[expect(
     clippy::large_enum_variant,
     reason = "a box would be allocated per message and freed on the tick"
 )]
 enum Drive {
     Nothing,
-    Mirror { forecast: Forecast, valid_at: Mono },
+    Mirror {
+        forecast: Forecast,
+        valid_at: Mono,
+        turn: Option<TurnForecast>,
+        grip: Option<f64>,
+    },
     Play(Box<Trajectory>),
 }
 
@@ -240,6 +66,7 @@ pub struct Core {
     safety: Safety,
     controller: Controller,
     plant: Plant,
+    gripper: Gripper,
     rings: Rings,
     drive: Drive,
     mapping: Mapping,
@@ -250,6 +77,12 @@ pub struct Core {
     out_of_reach: bool,
     tick: u64,
     tip_m: Vector3<f64>,
+    orientation: UnitQuaternion<f64>,
+    orientation_error_rad: f64,
+    /// Where the tip was last asked to be turned to.
+    turned_to: Option<UnitQuaternion<f64>>,
+    /// The opening that the gripper is to go to.
+    opening: f64,
     target_m: Vector3<f64>,
     reference_m: Vector3<f64>,
     moving: bool,
@@ -257,19 +90,30 @@ pub struct Core {
 
 impl Core {
     /// A servo at rest.
-    pub fn new(config: CoreConfig, controller: Controller, plant: Plant, rings: Rings) -> Self {
+    pub fn new(
+        config: CoreConfig,
+        controller: Controller,
+        plant: Plant,
+        gripper: Gripper,
+        rings: Rings,
+    ) -> Self {
         let tip_m = controller.reference().p;
+        let orientation = controller.turn_reference().orientation;
         let mapping = Mapping {
             scale: 1.0,
             rotation: UnitQuaternion::identity(),
             hand_m: Vector3::zeros(),
             tip_m,
+            hand_orientation: None,
+            tip_orientation: orientation,
         };
         Self {
             safety: Safety::new(config.safety),
             config,
             controller,
             plant,
+            opening: gripper.opening(),
+            gripper,
             rings,
             drive: Drive::Nothing,
             mapping,
@@ -280,6 +124,9 @@ impl Core {
             out_of_reach: false,
             tick: 0,
             tip_m,
+            orientation,
+            orientation_error_rad: 0.0,
+            turned_to: None,
             target_m: tip_m,
             reference_m: tip_m,
             moving: false,
@@ -315,9 +162,14 @@ impl Core {
         if self.safety.is_following() && (limited || self.out_of_reach) {
             self.clamps += 1;
         }
+        self.gripper.step(self.opening, self.config.tick_s);
+        self.orientation = output.orientation;
+        self.orientation_error_rad = output.orientation_error_rad;
         self.tip_m = output.tip;
         self.reference_m = output.reference.p;
-        self.moving = output.reference.v.norm() > STILL_M_S || self.plant.qd().amax() > STILL_RAD_S;
+        self.moving = output.reference.v.norm() > STILL_M_S
+            || output.turn.angular_velocity.norm() > STILL_TURN_RAD_S
+            || self.plant.qd().amax() > STILL_RAD_S;
         self.tick += 1;
         let report = self.report(now);
         // A full ring means a stalled session; the servo does not wait for it.
@@ -333,16 +185,23 @@ impl Core {
                 ticket,
                 forecast,
                 valid_at,
+                turn,
+                grip,
                 lease,
             } => {
                 if let Drive::Mirror {
                     forecast: held,
                     valid_at: held_at,
+                    turn: held_turn,
+                    grip: held_grip,
                 } = &mut self.drive
                     && ticket == self.engagement
                 {
                     *held = forecast;
                     *held_at = valid_at;
+                    // One that appears only now has no reference at the engage to be seen from.
+                    *held_turn = held_turn.map(|held| turn.unwrap_or(held));
+                    *held_grip = grip.or(*held_grip);
                     self.safety.news(lease);
                 }
             }
@@ -362,20 +221,45 @@ impl Core {
 
     fn engage(&mut self, engagement: Engagement, now: Mono) {
         let drive = match engagement.source {
-            Source::Mirror { forecast, valid_at } => Drive::Mirror { forecast, valid_at },
+            Source::Mirror {
+                forecast,
+                valid_at,
+                turn,
+                grip,
+            } => Drive::Mirror {
+                forecast,
+                valid_at,
+                turn,
+                grip,
+            },
             Source::Play(trajectory) => Drive::Play(trajectory),
         };
-        if self.moving || !self.safety.engage(now, engagement.lease) {
+        // An orientation that is none would be the reference for all that follows.
+        let hand_orientation = match &drive {
+            Drive::Mirror { turn, valid_at, .. } => turn.map(|turn| {
+                let q = turn.at(now.secs_since(*valid_at)).orientation;
+                q.coords.iter().all(|v| v.is_finite()).then_some(q)
+            }),
+            Drive::Play(trajectory) => trajectory
+                .curve
+                .orientation
+                .is_some()
+                .then(|| trajectory.curve.orientation_at(0.0)),
+            Drive::Nothing => None,
+        };
+        if hand_orientation == Some(None)
+            || self.moving
+            || !self.safety.engage(now, engagement.lease)
+        {
             self.declined = engagement.ticket;
             self.discard(drive);
             return;
         }
         let hand_m = match &drive {
-            Drive::Mirror { forecast, valid_at } => forecast.at(now.secs_since(*valid_at)).position,
-            Drive::Play(trajectory) => trajectory
-                .spline
-                .eval(0.0)
-                .map_or(Vector3::zeros(), |jet| jet.x),
+            Drive::Mirror {
+                forecast, valid_at, ..
+            } => forecast.at(now.secs_since(*valid_at)).position,
+            Drive::Play(trajectory) => trajectory.curve.position_at(0.0),
             Drive::Nothing => Vector3::zeros(),
         };
         let old = std::mem::replace(&mut self.drive, drive);
@@ -386,7 +270,10 @@ impl Core {
             rotation: engagement.rotation,
             hand_m,
             tip_m,
+            hand_orientation: hand_orientation.flatten(),
+            tip_orientation: self.controller.turn_reference().orientation,
         };
+        self.turned_to = None;
         self.engagement = engagement.ticket;
         self.engaged_at = now;
         self.clamps = 0;
@@ -403,16 +290,28 @@ impl Core {
 
     fn demand(&mut self, now: Mono) -> Demand {
         self.out_of_reach = false;
+        // When the motion ends, the gripper stays as it is.
+        self.opening = self.gripper.opening();
         if !self.safety.is_following() {
             return Demand::Stop;
         }
         let since_s = now.secs_since(self.engaged_at);
         // A hand is in the middle of a motion; a plan begins where the tip is.
-        let (hand_m, eased) = match &self.drive {
+        let (hand_m, hand_orientation, grip, eased) = match &self.drive {
             Drive::Nothing => return Demand::Stop,
-            Drive::Mirror { forecast, valid_at } => {
+            Drive::Mirror {
+                forecast,
+                valid_at,
+                turn,
+                grip,
+            } => {
                 let horizon_s = now.secs_since(*valid_at) + self.config.lag_s;
-                (forecast.at(horizon_s).position, ramp(since_s / RAMP_S))
+                (
+                    forecast.at(horizon_s).position,
+                    turn.map(|turn| Some(turn.at(horizon_s).orientation)),
+                    *grip,
+                    ramp(since_s / RAMP_S),
+                )
             }
             Drive::Play(trajectory) => {
                 if since_s > trajectory.duration_s + SETTLE_S {
@@ -420,14 +319,34 @@ impl Core {
                     return Demand::Stop;
                 }
                 let t_s = (since_s + self.config.lag_s).min(trajectory.duration_s);
-                let jet = trajectory.spline.eval(t_s);
-                (jet.map_or(self.mapping.hand_m, |jet| jet.x), 1.0)
+                let curve = &trajectory.curve;
+                (
+                    curve.position_at(t_s),
+                    curve
+                        .orientation
+                        .is_some()
+                        .then(|| curve.orientation_at(t_s)),
+                    curve.grip_at(t_s),
+                    1.0,
+                )
             }
         };
         (self.target_m, self.out_of_reach) =
             self.mapping.place(hand_m, &self.config.workspace, eased);
+        if let Some(hand) = hand_orientation {
+            // Where a plan's curve is no orientation the last one holds, and the tick counts as clamped.
+            self.out_of_reach |= hand.is_none();
+            self.turned_to = hand
+                .map(|hand| self.mapping.orient(&hand, eased))
+                .or(self.turned_to);
+        }
+        if let Some(grip) = grip {
+            self.out_of_reach |= !grip.is_finite();
+            self.opening = grip;
+        }
         Demand::Follow {
             target: self.target_m,
+            orientation: self.turned_to,
             speed_scale: self.safety.speed_scale(now),
         }
     }
@@ -452,6 +371,9 @@ impl Core {
             target_m: self.target_m,
             reference_m: self.reference_m,
             tip_m: self.tip_m,
+            orientation: self.orientation,
+            orientation_error_rad: self.orientation_error_rad,
+            opening: self.gripper.opening(),
             q: *self.plant.q(),
             clamps: self.clamps,
         }

@@ -1,4 +1,4 @@
-//! From hand to tip: a stated, rigid, scaled mapping with a fresh reference at every engage.
+//! From hand to tip: a stated, rigid mapping, scaled in its lengths, with a fresh reference at every engage.
 
 use nalgebra::{UnitQuaternion, Vector3};
 
@@ -24,7 +24,7 @@ impl Workspace {
     }
 }
 
-/// `tip = tip₀ + s · R · (hand − hand₀)`.
+/// `tip = tip₀ + s · R · (hand − hand₀)`, and for orientations `q_tip = R · (q_hand · q_hand₀⁻¹) · R⁻¹ · q_tip₀`: rotation is never scaled.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Mapping {
     /// Tip metres per hand metre.
@@ -35,6 +35,10 @@ pub struct Mapping {
     pub hand_m: Vector3<f64>,
     /// The tip at that instant, m in base axes.
     pub tip_m: Vector3<f64>,
+    /// The hand's orientation at that instant, if it has one.
+    pub hand_orientation: Option<UnitQuaternion<f64>>,
+    /// The tip's at that instant: tip axes to base axes.
+    pub tip_orientation: UnitQuaternion<f64>,
 }
 
 impl Mapping {
@@ -49,6 +53,20 @@ impl Mapping {
         let offset = self.rotation * (hand_m - self.hand_m) * self.scale;
         let (placed, clipped) = workspace.clip(self.tip_m + offset);
         (self.tip_m + (placed - self.tip_m) * eased, clipped)
+    }
+
+    /// How the tip is to be oriented when the hand is oriented as `hand`, the turn since the engage eased in to the share `eased` ∈ [0, 1].
+    pub fn orient(&self, hand: &UnitQuaternion<f64>, eased: f64) -> UnitQuaternion<f64> {
+        let Some(reference) = &self.hand_orientation else {
+            return self.tip_orientation;
+        };
+        let turned = self.rotation * (hand * reference.inverse()) * self.rotation.inverse();
+        let turned = if eased < 1.0 {
+            UnitQuaternion::from_scaled_axis(turned.scaled_axis() * eased)
+        } else {
+            turned
+        };
+        turned * self.tip_orientation
     }
 
     /// The hand position that [`Mapping::place`] would put at `tip_m`.
@@ -68,6 +86,8 @@ mod tests {
             rotation: UnitQuaternion::from_euler_angles(0.3, -1.0, 2.0),
             hand_m: Vector3::new(1.0, 2.0, 3.0),
             tip_m: Vector3::new(0.4, 0.0, 0.5),
+            hand_orientation: None,
+            tip_orientation: UnitQuaternion::identity(),
         };
         let hand = Vector3::new(0.2, 2.5, 3.1);
         let home_m = Vector3::new(0.4, 0.04, 0.5);
@@ -79,5 +99,36 @@ mod tests {
         assert!(clamped && ((tip - home_m).norm() - 0.05).abs() < 1e-12);
         let (halfway, _) = mapping.place(hand, &small, 0.5);
         assert!((halfway - (tip + mapping.tip_m) * 0.5).norm() < 1e-12);
+    }
+
+    #[test]
+    fn turning_is_that_of_the_hand_seen_in_base_axes_and_never_scaled() {
+        let mapping = Mapping {
+            scale: 0.1,
+            // Hand axes: x to the right of the person is −y of the base.
+            rotation: UnitQuaternion::from_euler_angles(0.0, 0.0, -core::f64::consts::FRAC_PI_2),
+            hand_m: Vector3::zeros(),
+            tip_m: Vector3::zeros(),
+            hand_orientation: Some(UnitQuaternion::from_euler_angles(0.4, 0.5, -0.6)),
+            tip_orientation: UnitQuaternion::from_euler_angles(3.0, 0.1, 0.2),
+        };
+        let hand = |turn: Vector3<f64>| {
+            UnitQuaternion::from_scaled_axis(turn) * mapping.hand_orientation.unwrap()
+        };
+        let seen = |turn: Vector3<f64>, eased: f64| {
+            (mapping.orient(&hand(turn), eased) * mapping.tip_orientation.inverse()).scaled_axis()
+        };
+        let turn = Vector3::x() * 0.8;
+        assert!((seen(turn, 1.0) + Vector3::y() * 0.8).norm() < 1e-12);
+        assert!((seen(turn, 0.25) + Vector3::y() * 0.2).norm() < 1e-12);
+        assert!(seen(turn, 0.0).norm() < 1e-12 && seen(Vector3::zeros(), 1.0).norm() < 1e-12);
+        // A quaternion and its negative are one orientation, while it is eased in too.
+        let negative = UnitQuaternion::new_unchecked(-hand(turn).into_inner());
+        for eased in [0.25, 1.0] {
+            let angle = mapping
+                .orient(&negative, eased)
+                .angle_to(&mapping.orient(&hand(turn), eased));
+            assert!(angle < 1e-12);
+        }
     }
 }

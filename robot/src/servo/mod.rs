@@ -6,13 +6,14 @@
 mod brake;
 mod core;
 mod mapping;
+mod orders;
 mod stats;
 pub mod thread;
 
-pub use self::core::{
-    Core, CoreConfig, Engagement, Handle, Lease, Order, RAMP_S, Report, Rings, Source, Ticket,
-    Trajectory, ramp, rings,
-};
+pub use self::core::{Core, CoreConfig, RAMP_S, ramp};
 pub use brake::Brake;
 pub use mapping::{Mapping, Workspace};
+pub use orders::{
+    Engagement, Handle, Lease, Order, Report, Rings, Source, Ticket, Trajectory, rings,
+};
 pub use stats::TickStats;

@@ -12,12 +12,13 @@ use std::sync::Arc;
 
 use nalgebra::{Quaternion, UnitQuaternion};
 use telemime_endpoint::Mono;
-use telemime_protocol::checkpoint::Plan;
+use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::turn::{WireRotation, dequantise_grip, quantise_grip};
 use telemime_protocol::wire::v1::{
     Cause, Drive, Engage, Info, MAX_PLAN_LEN, Message, ModelId, OperatorControl, OperatorDatagram,
     Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
@@ -97,7 +98,7 @@ pub struct Session {
     epoch: u32,
     clock: SessionClock,
     skill: Option<Arc<Skill>>,
-    plan: Option<(u32, Plan<3>)>,
+    plan: Option<(u32, PosePlan)>,
     mirror: Option<Mirror>,
     engagement: u32,
     acknowledged: u32,
@@ -184,7 +185,7 @@ impl Session {
         match message {
             OperatorControl::Model { id, bytes } => self.store_model(id, &bytes),
             OperatorControl::Plan { id, bytes } => {
-                match codec::decode::<Plan<3>, MAX_PLAN_LEN>(&bytes) {
+                match codec::decode::<PosePlan, MAX_PLAN_LEN>(&bytes) {
                     Ok(plan) => {
                         self.plan = Some((id, plan));
                         self.send(&RobotControl::PlanStored { id });
@@ -272,6 +273,11 @@ impl Session {
                 t_us,
                 hand_m: report.mapping.hand_m.cast::<f32>().into(),
                 tip_m: report.mapping.tip_m.cast::<f32>().into(),
+                hand_q: report
+                    .mapping
+                    .hand_orientation
+                    .map(|q| WireRotation::quantise(&q)),
+                tip_q: WireRotation::quantise(&report.mapping.tip_orientation),
             });
         } else if pending && report.declined == self.ticket() {
             self.acknowledged = self.engagement;
@@ -373,6 +379,7 @@ impl Session {
                 state,
                 model,
                 params,
+                pose,
             } => {
                 let mirror = Mirror::new(engage.path_bound_um).ok_or(Refusal::BadMapping)?;
                 let state = state.dequantise();
@@ -382,7 +389,13 @@ impl Session {
                     return Err(Refusal::StaleReference);
                 }
                 let forecast = self.forecast(&state, *model, &params.dequantise());
-                (Source::Mirror { forecast, valid_at }, Some(mirror))
+                let source = Source::Mirror {
+                    forecast,
+                    valid_at,
+                    turn: self.turn_forecast(state.t, *model, pose.turn.as_ref()),
+                    grip: pose.grip.map(dequantise_grip),
+                };
+                (source, Some(mirror))
             }
             Drive::Play { plan } => {
                 let (_, held) = self
@@ -390,13 +403,13 @@ impl Session {
                     .as_ref()
                     .filter(|(id, _)| id == plan)
                     .ok_or(Refusal::BadPlan)?;
-                let spline = held.spline().map_err(|_| Refusal::BadPlan)?;
-                let (start_s, duration_s) = spline.span_s();
+                let curve = held.curve().map_err(|_| Refusal::BadPlan)?;
+                let (start_s, duration_s) = curve.position.span_s();
                 if start_s != 0.0 {
                     return Err(Refusal::BadPlan);
                 }
                 (
-                    Source::Play(Box::new(Trajectory { spline, duration_s })),
+                    Source::Play(Box::new(Trajectory { curve, duration_s })),
                     None,
                 )
             }
@@ -455,6 +468,8 @@ impl Session {
             tick_p99_ns: self.timing.p99_ns,
             overruns: self.timing.overruns,
             tip_m: report.tip_m.cast::<f32>().into(),
+            tip_q: WireRotation::quantise(&report.orientation),
+            grip: Some(quantise_grip(report.opening)),
             q: report
                 .q
                 .iter()

@@ -2,10 +2,11 @@
 
 use telemime_endpoint::Mono;
 use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid};
-use telemime_protocol::predict::{Forecast, HandState, Params};
+use telemime_protocol::predict::{Forecast, HandState, Params, TurnForecast, checksum};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::knots;
 use telemime_protocol::wire::state::WireState;
+use telemime_protocol::wire::turn::{WireTurn, dequantise_grip};
 use telemime_protocol::wire::v1::{Motion, PathTail, Refusal, WireKnot, model_tag};
 
 use super::Session;
@@ -60,11 +61,13 @@ impl Session {
         let diverged = mirror.diverged;
         let model = if diverged { 0 } else { motion.model };
         let mut forecast = self.forecast(&state, model, &motion.params.dequantise());
+        let mut turn = self.turn_forecast(state.t, model, motion.pose.turn.as_ref());
         let checked = motion
             .checksum
             .filter(|_| !diverged && self.predicts_with(motion.model));
-        if checked.is_some_and(|sum| sum != forecast.checksum()) {
+        if checked.is_some_and(|sum| sum != checksum(&forecast, turn.as_ref())) {
             forecast = Forecast::constant_velocity(&state, &motion.params.dequantise());
+            turn = self.turn_forecast(state.t, 0, motion.pose.turn.as_ref());
             if let Some(mirror) = &mut self.mirror {
                 mirror.diverged = true;
             }
@@ -73,6 +76,8 @@ impl Session {
         self.order(Order::Track {
             forecast,
             valid_at,
+            turn,
+            grip: motion.pose.grip.map(dequantise_grip),
             ticket: self.ticket(),
             lease,
         });
@@ -138,6 +143,26 @@ impl Session {
             Some(skill) if self.predicts_with(model) => skill.predictor().forecast(state, params),
             _ => Forecast::constant_velocity(state, params),
         }
+    }
+
+    /// The same for the orientation, if there is one; `t` is when it was valid.
+    pub(super) fn turn_forecast(
+        &self,
+        t: Stamp,
+        model: u16,
+        turn: Option<&WireTurn>,
+    ) -> Option<TurnForecast> {
+        let turn = turn?;
+        let (state, params) = (turn.dequantise(t), turn.params.dequantise());
+        let learned = self
+            .skill
+            .as_ref()
+            .filter(|_| self.predicts_with(model))
+            .and_then(|skill| skill.turn());
+        Some(match learned {
+            Some(learned) => learned.predictor.forecast(&state, &params),
+            None => TurnForecast::constant_velocity(&state, &params),
+        })
     }
 
     fn predicts_with(&self, model: u16) -> bool {

@@ -8,6 +8,7 @@ use telemime_protocol::predict::{HandState, Params};
 use telemime_protocol::skill::{Skill, example};
 use telemime_protocol::wire::knots;
 use telemime_protocol::wire::state::WireState;
+use telemime_protocol::wire::turn::WirePose;
 use telemime_protocol::wire::v1::{Motion, WireParams};
 use telemime_sim::arm::Joints;
 
@@ -70,12 +71,17 @@ fn report(state: RobotState) -> Report {
             rotation: UnitQuaternion::identity(),
             hand_m: Vector3::new(0.1, 0.2, 2.5),
             tip_m,
+            hand_orientation: None,
+            tip_orientation: UnitQuaternion::identity(),
         },
         moving: false,
         age_s: 0.0,
         target_m: tip_m,
         reference_m: tip_m,
         tip_m,
+        orientation: UnitQuaternion::identity(),
+        orientation_error_rad: 0.0,
+        opening: 1.0,
         q: Joints::zeros(),
         clamps: 0,
     }
@@ -214,6 +220,7 @@ impl Bench {
                 state: WireState::quantise(&HandState::first(self.stamp(0), hand())).unwrap(),
                 model: 0,
                 params: WireParams::quantise(&STEADY),
+                pose: WirePose::default(),
             },
             scale: 0.1,
             rotation: [1.0, 0.0, 0.0, 0.0],
@@ -259,6 +266,7 @@ impl Bench {
             params: WireParams::quantise(&STEADY),
             checksum: None,
             state: WireState::quantise(&moving(self.stamp(ms_ago))).unwrap(),
+            pose: WirePose::default(),
             first_knot: 0,
             knots: Vec::new(),
         }

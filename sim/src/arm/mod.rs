@@ -1,4 +1,4 @@
-//! A serial manipulator from its URDF: kinematics, rigid-body dynamics, and a plant that integrates them.
+//! A serial manipulator from its URDF: kinematics, rigid-body dynamics, a plant that integrates them, and a gripper.
 //!
 //! Everything on the real-time path works on fixed arrays of [`MAX_JOINTS`] in workspaces that the caller
 //! owns ([`Kinematics`], [`Dynamics`]): nothing allocates after [`ArmModel::from_urdf`].
@@ -6,6 +6,7 @@
 
 mod dynamics;
 mod error;
+mod gripper;
 mod inertia;
 mod kinematics;
 mod model;
@@ -20,6 +21,7 @@ use nalgebra::{SMatrix, SVector, Vector3};
 
 pub use dynamics::Dynamics;
 pub use error::{ArmError, Notice};
+pub use gripper::{Gripper, GripperError};
 pub use inertia::Body;
 pub use kinematics::Kinematics;
 pub use model::{ArmModel, Joint, JointKind, LoadOptions};

@@ -150,10 +150,7 @@ mod tests {
 
     fn set(name: &str, files: &[&str]) -> Demonstrations {
         let samples: Vec<_> = (0..8)
-            .map(|i| Sample {
-                t_s: f64::from(i),
-                position: Vector3::zeros(),
-            })
+            .map(|i| Sample::at(f64::from(i), Vector3::zeros()))
             .collect();
         Demonstrations {
             name: name.to_owned(),

@@ -17,9 +17,9 @@ fn state(state: RobotState, cause: Cause) -> RobotControl {
     }
 }
 
-fn plan() -> Plan<3> {
+fn plan() -> PosePlan {
     let x = [home(), home() + Vector3::x(), home()];
-    select::bounded(&[0.0, 1.0, 2.0], &x, 0.01).unwrap()
+    select::bounded(&[0.0, 1.0, 2.0], &x, 0.01).unwrap().into()
 }
 
 #[test]
@@ -98,9 +98,8 @@ fn what_a_declined_request_took_is_not_counted() {
     for i in 0..10 {
         bench.now.0 += 33 * MS;
         let sample = HandSample {
-            t: bench.now,
-            x: home(),
             resting: i < 7,
+            ..HandSample::at(bench.now, home())
         };
         bench.session.handle_sample(bench.now, sample);
     }
@@ -111,6 +110,8 @@ fn what_a_declined_request_took_is_not_counted() {
         t_us: 0,
         hand_m: [0.0; 3],
         tip_m: [0.0; 3],
+        hand_q: None,
+        tip_q: WireRotation::default(),
     });
     bench.hears(&refused(Refusal::NotYours));
     assert_eq!(bench.session.counters(), counters, "that was no request");

@@ -3,7 +3,7 @@
 use super::*;
 use nalgebra::UnitQuaternion;
 use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid, TICK_NS, tick_of};
-use telemime_protocol::predict::Forecast;
+use telemime_protocol::predict::{Forecast, checksum};
 use telemime_protocol::wire::knots;
 use telemime_protocol::wire::v1::model_tag;
 
@@ -155,7 +155,7 @@ fn keyframes_carry_a_checksum_of_what_the_robot_will_compute() {
         let forecast = skill
             .predictor()
             .forecast(&m.state.dequantise(), &m.params.dequantise());
-        assert_eq!(m.checksum, Some(forecast.checksum()));
+        assert_eq!(m.checksum, Some(checksum(&forecast, None)));
     }
 }
 
@@ -170,11 +170,7 @@ fn late_repeated_and_impossible_samples_are_dropped_and_counted() {
         (Stamp(bench.now.0 - MS), home() + Vector3::x()),
         (Stamp(bench.now.0 + MS), Vector3::repeat(f64::NAN)),
     ] {
-        let sample = HandSample {
-            t,
-            x,
-            resting: false,
-        };
+        let sample = HandSample::at(t, x);
         bench.session.handle_sample(bench.now, sample);
     }
     bench.drain();
@@ -382,11 +378,7 @@ fn however_fast_the_samples_come_motions_keep_their_distance() {
     for i in 0..1000 {
         bench.idle(1);
         let x = home() + Vector3::new((0.05 * f64::from(i)).sin(), f64::from(i % 7), 0.0) * 0.1;
-        let sample = HandSample {
-            t: bench.now,
-            x,
-            resting: false,
-        };
+        let sample = HandSample::at(bench.now, x);
         bench.session.handle_sample(bench.now, sample);
         bench.drain();
         let motions = bench.motions();

@@ -2,13 +2,13 @@
 
 use super::*;
 
-fn plan() -> Plan<3> {
+fn plan() -> PosePlan {
     let t: Vec<f64> = (0..60).map(|i| f64::from(i) / 30.0).collect();
     let x: Vec<_> = t
         .iter()
         .map(|t| hand() + Vector3::new((3.0 * t).sin() * 0.3, 0.1 * t, 0.0))
         .collect();
-    select::bounded(&t, &x, 0.005).unwrap()
+    select::bounded(&t, &x, 0.005).unwrap().into()
 }
 
 fn play(bench: &Bench, engagement: u32, plan: u32) -> Engage {
@@ -58,6 +58,8 @@ fn an_engagement_is_acknowledged_once_when_the_servo_reports_it() {
             t_us: bench.stamp(0).0 / 1000,
             hand_m: mapping.hand_m.cast::<f32>().into(),
             tip_m: mapping.tip_m.cast::<f32>().into(),
+            hand_q: None,
+            tip_q: WireRotation::default(),
         },
         RobotControl::State {
             state: RobotState::Engaged,
@@ -278,13 +280,10 @@ fn a_plan_is_played_from_its_beginning() {
     else {
         panic!("{:?}", bench.orders)
     };
-    let expected = plan.spline().unwrap();
-    assert_eq!(trajectory.duration_s, expected.span_s().1);
+    let expected = plan.curve().unwrap();
+    assert_eq!(trajectory.duration_s, expected.end_s());
     for t_s in [0.0, 0.7, 1.9] {
-        assert_eq!(
-            trajectory.spline.eval(t_s).unwrap().x,
-            expected.eval(t_s).unwrap().x
-        );
+        assert_eq!(trajectory.curve.position_at(t_s), expected.position_at(t_s));
     }
 }
 

@@ -1,7 +1,7 @@
 //! Datagrams: what is taken, what is dropped, for how long it authorises motion.
 
 use super::*;
-use telemime_protocol::predict::Forecast;
+use telemime_protocol::predict::{Forecast, checksum};
 use telemime_protocol::wire::v1::model_tag;
 
 fn go(bench: &Bench, seq: u32, ms_ago: i64) -> OperatorDatagram {
@@ -18,7 +18,7 @@ fn go(bench: &Bench, seq: u32, ms_ago: i64) -> OperatorDatagram {
 fn playing() -> Bench {
     let mut bench = Bench::ready(None);
     let x = [hand(), hand() + Vector3::x(), hand()];
-    let plan = select::bounded(&[0.0, 1.0, 2.0], &x, 0.01).unwrap();
+    let plan: PosePlan = select::bounded(&[0.0, 1.0, 2.0], &x, 0.01).unwrap().into();
     bench.control(&OperatorControl::Plan {
         id: 1,
         bytes: codec::encode(&plan),
@@ -193,13 +193,13 @@ fn a_divergence_is_reported_once_and_the_rest_is_constant_velocity() {
         assert_eq!(*forecast, Forecast::constant_velocity(&state, &params));
         false
     };
-    assert!(track(&mut bench, 1, &|own| Some(own.checksum())));
+    assert!(track(&mut bench, 1, &|own| Some(checksum(own, None))));
     assert!(track(&mut bench, 2, &|_| None));
     assert_eq!(bench.refusals(), []);
-    assert!(!track(&mut bench, 3, &|own| Some(own.checksum() ^ 1)));
+    assert!(!track(&mut bench, 3, &|own| Some(checksum(own, None) ^ 1)));
     assert_eq!(bench.refusals(), [Refusal::Diverged]);
-    assert!(!track(&mut bench, 4, &|own| Some(own.checksum())));
-    assert!(!track(&mut bench, 5, &|own| Some(own.checksum() ^ 1)));
+    assert!(!track(&mut bench, 4, &|own| Some(checksum(own, None))));
+    assert!(!track(&mut bench, 5, &|own| Some(checksum(own, None) ^ 1)));
     assert_eq!(bench.refusals(), [Refusal::Diverged]);
     assert_eq!(bench.dropped(), 0);
 }

@@ -1,19 +1,25 @@
 //! Training the memory-feature predictor, and finding on held-out demonstrations how far to trust it.
 
-use nalgebra::{SMatrix, SVector, Vector3};
+mod blocks;
+mod course;
+
+use nalgebra::{SVector, UnitQuaternion, Vector3};
 use rand::SeedableRng;
 use rand_xoshiro::Xoshiro256PlusPlus;
+use telemime_protocol::pose;
 use telemime_protocol::predict::{
-    BLOCK, Calibration, FEATURES, HandState, KNOT_SPACING_S, MAX_KNOTS, Model, Regression,
-    Standardisation, TARGETS,
+    Calibration, FEATURES, HandState, MAX_KNOTS, Model, ModelError, Standardisation, TARGETS,
+    TurnModel,
 };
 use telemime_protocol::time::Stamp;
 
-use super::em::{self, Convergence, EmOptions, add_outer, mirror};
+use super::em::{self, Convergence, EmOptions};
 use super::kmeans::kmeans;
 use super::trial::Trial;
 use super::{LearnError, Progress};
 use crate::demonstration::Demonstration;
+use course::Fitted;
+pub(super) use course::{Course, Places, Turns};
 
 /// Dimension of the joint that EM sees: the features and three displacements.
 const JOINT: usize = FEATURES + 9;
@@ -58,9 +64,12 @@ impl Default for PredictorOptions {
 }
 
 /// Features and displacements of one moment.
-struct Row {
+#[derive(Clone)]
+pub(super) struct Row {
     features: SVector<f64, FEATURES>,
     targets: [f64; TARGETS],
+    /// Of the hand, where it is what is predicted.
+    orientation: UnitQuaternion<f64>,
 }
 
 /// Trains a predictor and calibrates it by leaving out one demonstration at a time.
@@ -76,13 +85,32 @@ pub fn train(
     seed: u64,
     progress: &mut impl FnMut(Progress),
 ) -> Result<Model, LearnError> {
-    let rows: Vec<Vec<Row>> = demonstrations
-        .iter()
-        .map(|d| rows(d, options.knots))
-        .collect();
+    train_course::<Places>(demonstrations, options, seed, progress)
+}
+
+/// The same for orientation.
+///
+/// # Errors
+/// As [`train`].
+pub fn train_turns(
+    demonstrations: &[Demonstration],
+    options: &PredictorOptions,
+    seed: u64,
+    progress: &mut impl FnMut(Progress),
+) -> Result<TurnModel, LearnError> {
+    train_course::<Turns>(demonstrations, options, seed, progress)
+}
+
+fn train_course<C: Course>(
+    demonstrations: &[Demonstration],
+    options: &PredictorOptions,
+    seed: u64,
+    progress: &mut impl FnMut(Progress),
+) -> Result<C::Model, LearnError> {
+    let rows = rows::<C>(demonstrations, options.knots);
     let all: Vec<&Row> = rows.iter().flatten().collect();
-    let model = fit(&all, None, options, seed)?;
-    let mut trial = Trial::straight(demonstrations, options.knots);
+    let model = fit::<C>(&all, None, options, seed)?;
+    let mut trial = Trial::<C>::straight(demonstrations, options.knots);
 
     let folds = options.folds.min(demonstrations.len());
     if folds > 1 {
@@ -94,7 +122,11 @@ pub fn train(
                 .filter(|(i, _)| *i != held)
                 .flat_map(|(_, r)| r)
                 .collect();
-            trial.hold_out(&fit(&others, None, options, seed)?, &demonstrations[held]);
+            let without = C::model(
+                &fit::<C>(&others, None, options, seed)?,
+                Calibration::UNTRIED,
+            )?;
+            trial.hold_out(&without, &demonstrations[held]);
             progress(Progress::Held {
                 done: fold + 1,
                 of: folds,
@@ -102,15 +134,10 @@ pub fn train(
         }
     }
     progress(Progress::Predictor {
-        components: model.components().len(),
+        components: model.components.len(),
         samples: all.len(),
     });
-    Ok(Model::new(
-        model.knots(),
-        model.standardisation().clone(),
-        model.components().to_vec(),
-        trial.calibration(),
-    )?)
+    Ok(C::model(&model, trial.calibration())?)
 }
 
 /// Trains without calibration from given hard labels, one a training row in order: for comparison
@@ -123,18 +150,16 @@ pub fn train_from_labels(
     labels: &[usize],
     options: &PredictorOptions,
 ) -> Result<Model, LearnError> {
-    let rows: Vec<Row> = demonstrations
-        .iter()
-        .flat_map(|d| rows(d, options.knots))
-        .collect();
-    let rows: Vec<&Row> = rows.iter().collect();
+    let rows = rows::<Places>(demonstrations, options.knots);
+    let rows: Vec<&Row> = rows.iter().flatten().collect();
     if labels.len() != rows.len() {
         return Err(LearnError::TooFewRows {
             found: labels.len(),
             needed: rows.len(),
         });
     }
-    fit(&rows, Some(labels), options, 0)
+    let fitted = fit::<Places>(&rows, Some(labels), options, 0)?;
+    Ok(Places::model(&fitted, Calibration::UNTRIED)?)
 }
 
 /// The states of a demonstration, sample by sample.
@@ -152,16 +177,24 @@ pub fn states(d: &Demonstration) -> impl Iterator<Item = HandState> + '_ {
     })
 }
 
-/// The displacement (m) at knot `j`, from 1; past the end of the recording the hand stays.
-pub(super) fn displacement(d: &Demonstration, i: usize, j: usize) -> Vector3<f64> {
-    let s = &d.samples()[i];
-    d.position_at(s.t_s + j as f64 * KNOT_SPACING_S) - s.position
+/// The rows of each demonstration.
+fn rows<C: Course>(demonstrations: &[Demonstration], knots: usize) -> Vec<Vec<Row>> {
+    // Where orientation is not what is predicted, this is the mean of nothing.
+    let orientations = demonstrations
+        .iter()
+        .flat_map(|d| d.samples().iter().filter_map(|s| s.orientation))
+        .map(|q| (1.0, q));
+    let chart = pose::mean(orientations).unwrap_or_default();
+    demonstrations
+        .iter()
+        .map(|d| rows_of::<C>(d, knots, &chart))
+        .collect()
 }
 
-fn rows(d: &Demonstration, knots: usize) -> Vec<Row> {
+fn rows_of<C: Course>(d: &Demonstration, knots: usize, chart: &UnitQuaternion<f64>) -> Vec<Row> {
     let mut last_s = f64::NEG_INFINITY;
     let mut rows = Vec::with_capacity(d.samples().len());
-    for (i, state) in states(d).enumerate() {
+    for (i, state) in C::states(d).iter().enumerate() {
         let t_s = d.samples()[i].t_s;
         if t_s - last_s < LEAST_SPACING_S {
             continue;
@@ -169,11 +202,13 @@ fn rows(d: &Demonstration, knots: usize) -> Vec<Row> {
         last_s = t_s;
         let mut targets = [0.0; TARGETS];
         for (j, y) in targets.chunks_exact_mut(3).take(knots).enumerate() {
-            y.copy_from_slice(displacement(d, i, j + 1).as_slice());
+            y.copy_from_slice(C::displacement(d, i, j + 1).as_slice());
         }
+        let (features, orientation) = C::row(state, chart);
         rows.push(Row {
-            features: state.features(),
+            features,
             targets,
+            orientation,
         });
     }
     rows
@@ -224,14 +259,14 @@ fn isotropic(variance: &[f64], scale: &mut [f64]) {
     }
 }
 
-fn fit(
+fn fit<C: Course>(
     rows: &[&Row],
     labels: Option<&[usize]>,
     options: &PredictorOptions,
     seed: u64,
-) -> Result<Model, LearnError> {
+) -> Result<Fitted, LearnError> {
     if !(1..=MAX_KNOTS).contains(&options.knots) {
-        return Err(telemime_protocol::predict::ModelError::Knots {
+        return Err(ModelError::Knots {
             found: options.knots,
         }
         .into());
@@ -260,13 +295,19 @@ fn fit(
             em::responsibilities(&joint, &clusters.labels, &em_options)?
         }
     };
-    let components = regressions(&scaled, &shares, stride, &scaling, &em_options)?;
-    Ok(Model::new(
-        options.knots,
-        scaling.features,
+    let charts = C::charts(&scaled, &shares, stride);
+    let mut features = scaling.features.clone();
+    if !charts.is_empty() {
+        features.mean.fixed_rows_mut::<3>(0).fill(0.0);
+    }
+    let seen = |k: usize| C::seen(&scaled, charts.get(k), features.scale[0]);
+    let components = blocks::regressions(seen, &shares, stride, &scaling, &em_options)?;
+    Ok(Fitted {
+        knots: options.knots,
+        standardisation: features,
         components,
-        Calibration::UNTRIED,
-    )?)
+        charts,
+    })
 }
 
 fn scale_row(r: &Row, scaling: &Scaling) -> Row {
@@ -281,6 +322,7 @@ fn scale_row(r: &Row, scaling: &Scaling) -> Row {
     Row {
         features: (r.features - scaling.features.mean).component_div(&scaling.features.scale),
         targets,
+        orientation: r.orientation,
     }
 }
 
@@ -294,150 +336,4 @@ fn joint(r: &Row, knots: usize) -> SVector<f64, JOINT> {
         z.fixed_rows_mut::<3>(FEATURES + 3 * n).copy_from(&block);
     }
     z
-}
-
-/// The blocks of one component's scatter that the regression needs.
-struct Blocks {
-    n: f64,
-    feature_mean: SVector<f64, FEATURES>,
-    target_mean: [f64; TARGETS],
-    ff: SMatrix<f64, FEATURES, FEATURES>,
-    fy: [[f64; TARGETS]; FEATURES],
-    yy: [[f64; BLOCK]; MAX_KNOTS],
-}
-
-impl Blocks {
-    fn zeros() -> Self {
-        Self {
-            n: 0.0,
-            feature_mean: SVector::zeros(),
-            target_mean: [0.0; TARGETS],
-            ff: SMatrix::zeros(),
-            fy: [[0.0; TARGETS]; FEATURES],
-            yy: [[0.0; BLOCK]; MAX_KNOTS],
-        }
-    }
-
-    fn of<'a>(rows: &[Row], shares: impl Iterator<Item = &'a f64> + Clone) -> Self {
-        let mut b = Self::zeros();
-        for (row, &r) in rows.iter().zip(shares.clone()) {
-            b.n += r;
-            b.feature_mean += row.features * r;
-            for (m, y) in b.target_mean.iter_mut().zip(&row.targets) {
-                *m += r * y;
-            }
-        }
-        let n = b.n.max(f64::MIN_POSITIVE);
-        b.feature_mean /= n;
-        b.target_mean.iter_mut().for_each(|m| *m /= n);
-        for (row, &r) in rows.iter().zip(shares) {
-            let f = row.features - b.feature_mean;
-            let mut y = row.targets;
-            y.iter_mut().zip(&b.target_mean).for_each(|(y, m)| *y -= m);
-            add_outer(&mut b.ff, &f, r);
-            for (fy, f) in b.fy.iter_mut().zip(f.iter()) {
-                let s = r * f;
-                fy.iter_mut().zip(&y).for_each(|(v, y)| *v += s * y);
-            }
-            for (yy, y) in b.yy.iter_mut().zip(y.chunks_exact(3)) {
-                yy.iter_mut()
-                    .zip(outer(y, y))
-                    .for_each(|(v, o)| *v += r * o);
-            }
-        }
-        mirror(&mut b.ff);
-        b
-    }
-
-    /// self·a + other·c, moments only.
-    fn combine(&mut self, a: f64, other: &Self, c: f64) {
-        self.ff = self.ff * a + other.ff * c;
-        let mix = |to: &mut [f64], from: &[f64]| {
-            to.iter_mut()
-                .zip(from)
-                .for_each(|(t, f)| *t = *t * a + f * c);
-        };
-        mix(self.fy.as_flattened_mut(), other.fy.as_flattened());
-        mix(self.yy.as_flattened_mut(), other.yy.as_flattened());
-    }
-}
-
-/// The last M step, over all knots, and the regressions of it.
-///
-/// `C_k = (S_k + ν·T)/(N_k + ν)`; `B = (C_ff + ridge·I)⁻¹ C_fy`;
-/// `V = C_yy − BᵀC_fy − C_yf B + BᵀC_ff B` with the covariances before the ridge.
-fn regressions(
-    rows: &[Row],
-    shares: &[f64],
-    stride: usize,
-    scaling: &Scaling,
-    options: &EmOptions,
-) -> Result<Vec<Regression>, LearnError> {
-    let mut blocks: Vec<Blocks> = (0..stride)
-        .map(|k| Blocks::of(rows, shares.iter().skip(k).step_by(stride)))
-        .collect();
-    let total: f64 = blocks.iter().map(|b| b.n).sum();
-    let mut tied = Blocks::zeros();
-    for b in &blocks {
-        tied.combine(1.0, b, 1.0 / total);
-    }
-    let weights: f64 = blocks.iter().map(|b| b.n + options.weight_prior).sum();
-    blocks
-        .iter_mut()
-        .map(|b| {
-            let n = b.n + options.shrinkage;
-            b.combine(1.0 / n, &tied, options.shrinkage / n);
-            let weight = (b.n + options.weight_prior) / weights;
-            regression(b, weight, scaling, options.ridge)
-        })
-        .collect()
-}
-
-fn regression(
-    c: &Blocks,
-    weight: f64,
-    scaling: &Scaling,
-    ridge: f64,
-) -> Result<Regression, LearnError> {
-    let ridged = c.ff + SMatrix::<f64, FEATURES, FEATURES>::identity() * ridge;
-    let cholesky = ridged.cholesky().ok_or(LearnError::Singular)?;
-    let fy = SMatrix::<f64, FEATURES, TARGETS>::from_fn(|i, j| c.fy[i][j]);
-    let b = cholesky.solve(&fy);
-    let ff_b = c.ff * b;
-    let mut out = Regression {
-        weight,
-        mean: c.feature_mean,
-        factor: cholesky.l(),
-        target: [0.0; TARGETS],
-        gain: [[0.0; TARGETS]; FEATURES],
-        residual: [[0.0; BLOCK]; MAX_KNOTS],
-    };
-    for j in 0..TARGETS {
-        out.target[j] = c.target_mean[j] * scaling.target_scale[j] + scaling.target_mean[j];
-        for i in 0..FEATURES {
-            out.gain[i][j] = b[(i, j)] * scaling.target_scale[j];
-        }
-    }
-    for (knot, v) in out.residual.iter_mut().enumerate() {
-        let at = 3 * knot;
-        let (b, fy) = (b.fixed_columns::<3>(at), fy.fixed_columns::<3>(at));
-        let cross = b.transpose() * fy;
-        let explained = b.transpose() * ff_b.fixed_columns::<3>(at) - cross - cross.transpose();
-        let square = scaling.target_scale[at] * scaling.target_scale[at];
-        for ((v, yy), (i, j)) in v.iter_mut().zip(&c.yy[knot]).zip(UPPER) {
-            *v = (yy + 0.5 * (explained[(i, j)] + explained[(j, i)])) * square;
-            // A variance below rounding is none.
-            if i == j {
-                *v = v.max(0.0);
-            }
-        }
-    }
-    Ok(out)
-}
-
-/// The entries of a symmetric block in the order they are stored.
-const UPPER: [(usize, usize); BLOCK] = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)];
-
-fn outer(a: &[f64], b: &[f64]) -> [f64; BLOCK] {
-    UPPER.map(|(i, j)| a[i] * b[j])
 }

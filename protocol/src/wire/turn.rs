@@ -1,0 +1,205 @@
+//! Orientation and gripper as they travel: quantised, so that both ends predict from the same numbers.
+
+use nalgebra::{UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
+
+use super::codec::DecodeError;
+use super::v1::WireParams;
+use crate::pose;
+use crate::predict::TurnState;
+use crate::time::Stamp;
+
+/// Step of rotation vectors on the wire, rad.
+pub const ROTATION_STEP_RAD: f64 = 1e-4;
+
+/// π in steps, rounded up.
+const HALF_TURN: i16 = 31_416;
+
+/// Step of `memory_exponent` 0, rad; each further one doubles it.
+const MEMORY_STEP_RAD: f64 = 2.5e-5;
+
+/// 127 steps of it are more than π.
+const MAX_EXPONENT: u8 = 10;
+
+/// An orientation as its rotation vector, in steps of 0.1 mrad; of length at most π.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WireRotation(pub [i16; 3]);
+
+impl WireRotation {
+    /// The nearest that can travel.
+    pub fn quantise(q: &UnitQuaternion<f64>) -> Self {
+        Self(
+            pose::log(q)
+                .map(|v| (v / ROTATION_STEP_RAD).round() as i16)
+                .into(),
+        )
+    }
+
+    /// The orientation both ends use.
+    pub fn dequantise(self) -> UnitQuaternion<f64> {
+        pose::exp(&Vector3::from(
+            self.0.map(|v| f64::from(v) * ROTATION_STEP_RAD),
+        ))
+    }
+
+    pub(super) fn check(self, field: &'static str) -> Result<(), DecodeError> {
+        if self.0.iter().all(|v| (-HALF_TURN..=HALF_TURN).contains(v)) {
+            Ok(())
+        } else {
+            Err(DecodeError::Invalid {
+                field,
+                why: "an angle beyond half a turn",
+            })
+        }
+    }
+}
+
+/// [`TurnState`] in integers, valid when the hand state it travels with is. The memories travel as the
+/// rotation vectors `log(mᵢ⁻¹q)` in 8 bits each, with one common power-of-two step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WireTurn {
+    /// Orientation, from the hand's own axes to the tracker's.
+    pub q: WireRotation,
+    /// log₂ of the memories' step in units of 25 µrad.
+    pub memory_exponent: u8,
+    /// `log(mᵢ⁻¹q)` per memory and axis, in that step.
+    pub memory: [[i8; 3]; 4],
+    /// Parameters to predict with.
+    pub params: WireParams,
+}
+
+impl WireTurn {
+    /// Quantises a state with the parameters it is to be predicted by.
+    pub fn quantise(state: &TurnState, params: WireParams) -> Self {
+        let offsets = state.memory.map(|m| pose::between(&m, &state.q));
+        let largest = offsets.iter().map(|o| o.amax()).fold(0.0, f64::max);
+        let (mut memory_exponent, mut step) = (0, MEMORY_STEP_RAD);
+        while largest > 127.0 * step && memory_exponent < MAX_EXPONENT {
+            memory_exponent += 1;
+            step *= 2.0;
+        }
+        Self {
+            q: WireRotation::quantise(&state.q),
+            memory_exponent,
+            memory: offsets.map(|o| o.map(|v| (v / step).round() as i8).into()),
+            params,
+        }
+    }
+
+    /// The state both ends predict from; `t` is that of the hand state it came with.
+    pub fn dequantise(&self, t: Stamp) -> TurnState {
+        let q = self.q.dequantise();
+        let step = MEMORY_STEP_RAD * f64::from(1_u32 << self.memory_exponent.min(MAX_EXPONENT));
+        let memory = self.memory.map(|m| {
+            let back = Vector3::from(m.map(|v| f64::from(v) * -step));
+            pose::moved(&q, &back)
+        });
+        TurnState { t, q, memory }
+    }
+}
+
+/// What travels beside the hand's position: nothing, orientation, the gripper, or both.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WirePose {
+    /// Orientation, where the input has it.
+    pub turn: Option<WireTurn>,
+    /// How far the gripper is to be open, in steps of 1/255, where the input says so.
+    pub grip: Option<u8>,
+}
+
+impl WirePose {
+    pub(super) fn check(&self) -> Result<(), DecodeError> {
+        let Some(turn) = &self.turn else {
+            return Ok(());
+        };
+        if turn.memory_exponent > MAX_EXPONENT {
+            return Err(DecodeError::Invalid {
+                field: "pose.memory_exponent",
+                why: "above 10",
+            });
+        }
+        turn.q.check("pose.q")
+    }
+}
+
+/// An opening in steps of 1/255.
+pub fn quantise_grip(grip: f64) -> u8 {
+    (grip.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+/// An opening from 0 to 1.
+pub fn dequantise_grip(grip: u8) -> f64 {
+    f64::from(grip) / 255.0
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn rotation() -> impl Strategy<Value = UnitQuaternion<f64>> {
+        prop::array::uniform4(-1.0..1.0_f64)
+            .prop_filter("a direction", |v| {
+                v.iter().map(|v| v * v).sum::<f64>() > 1e-3
+            })
+            .prop_map(|[w, i, j, k]| {
+                UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(w, i, j, k))
+            })
+    }
+
+    proptest! {
+        #[test]
+        fn what_travels_is_near_and_in_range(
+            q in rotation(),
+            memory in prop::array::uniform4(rotation()),
+        ) {
+            let state = TurnState { t: Stamp(7), q, memory };
+            let params = WireParams { gain: 255, trust: 100, cv_damping: 0 };
+            let wire = WireTurn::quantise(&state, params);
+            let pose = WirePose { turn: Some(wire), grip: None };
+            prop_assert!(pose.check().is_ok());
+            let again = wire.dequantise(Stamp(7));
+            prop_assert!(again.q.angle_to(&q) < 0.9 * ROTATION_STEP_RAD);
+            let step = MEMORY_STEP_RAD * f64::from(1 << wire.memory_exponent);
+            for (a, b) in again.memory.iter().zip(&state.memory) {
+                // At half a turn the axis has two signs.
+                prop_assert!(a.angle_to(b) < step + 2.0 * ROTATION_STEP_RAD, "{}", a.angle_to(b));
+            }
+            // What was rounded once is not rounded again, as long as the axis has one sign.
+            if q.angle() < 3.14 {
+                prop_assert_eq!(WireRotation::quantise(&again.q), wire.q);
+            }
+        }
+    }
+
+    #[test]
+    fn openings_come_back() {
+        for step in 0..=255 {
+            assert_eq!(quantise_grip(dequantise_grip(step)), step);
+        }
+        assert_eq!((quantise_grip(-3.0), quantise_grip(9.0)), (0, 255));
+        assert_eq!(quantise_grip(f64::NAN), 0);
+    }
+
+    #[test]
+    fn what_no_encoder_writes_is_refused() {
+        let turn = |q, memory_exponent| WirePose {
+            turn: Some(WireTurn {
+                q: WireRotation(q),
+                memory_exponent,
+                memory: [[0; 3]; 4],
+                params: WireParams {
+                    gain: 0,
+                    trust: 0,
+                    cv_damping: 0,
+                },
+            }),
+            grip: None,
+        };
+        assert!(turn([31_416, -31_416, 0], 10).check().is_ok());
+        assert!(turn([31_417, 0, 0], 0).check().is_err());
+        assert!(turn([i16::MIN, 0, 0], 0).check().is_err());
+        assert!(turn([0; 3], 11).check().is_err());
+    }
+}

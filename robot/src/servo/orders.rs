@@ -1,0 +1,206 @@
+//! What the session tells the servo, what it is told, and the rings between them.
+
+use nalgebra::{UnitQuaternion, Vector3};
+use telemime_endpoint::Mono;
+use telemime_protocol::checkpoint::PoseCurve;
+use telemime_protocol::predict::{Forecast, TurnForecast};
+use telemime_protocol::wire::v1::{Cause, RobotState};
+use telemime_sim::arm::Joints;
+
+use super::brake::Brake;
+use super::mapping::Mapping;
+
+/// A motion to play: the hand over time in s from 0.
+#[derive(Debug)]
+pub struct Trajectory {
+    /// Position, and orientation and gripper where the plan has them.
+    pub curve: PoseCurve,
+    /// Its end, s.
+    pub duration_s: f64,
+}
+
+/// What drives an engagement.
+#[derive(Debug)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "a box would be allocated per message and freed on the tick"
+)]
+pub enum Source {
+    /// The hand, live: a forecast and when its state was valid on the robot's clock.
+    Mirror {
+        /// The prediction to start from.
+        forecast: Forecast,
+        /// When its newest sample was valid.
+        valid_at: Mono,
+        /// The hand's orientation, valid at the same moment: without one the tip keeps its own for the whole engagement.
+        turn: Option<TurnForecast>,
+        /// How far the gripper is to be open, from 0 to 1.
+        grip: Option<f64>,
+    },
+    /// A plan, from its beginning.
+    Play(Box<Trajectory>),
+}
+
+/// Which engagement of which session.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Ticket {
+    /// The session's epoch, unique for the life of the daemon; 0 is none.
+    pub epoch: u32,
+    /// The engagement's number within the session.
+    pub number: u32,
+}
+
+/// How long a message authorises motion, on the robot's clock and fixed when it arrived: what waits in a
+/// queue does not last longer for it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Lease {
+    /// When it arrived.
+    pub from: Mono,
+    /// When it ends.
+    pub until: Mono,
+}
+
+/// A granted request to engage.
+#[derive(Debug)]
+pub struct Engagement {
+    /// Whose it is.
+    pub ticket: Ticket,
+    /// What drives.
+    pub source: Source,
+    /// Tip metres per hand metre.
+    pub scale: f64,
+    /// Hand axes to base axes.
+    pub rotation: UnitQuaternion<f64>,
+    /// First lease.
+    pub lease: Lease,
+}
+
+/// What the session tells the servo. Stops are not among it: a [`Brake`] needs no queue.
+#[derive(Debug)]
+pub enum Order {
+    /// An operator has, or loses, authority.
+    Operator(bool),
+    /// Follow.
+    Engage(Engagement),
+    /// Newest prediction, and the lease that came with it.
+    Track {
+        /// For which engagement.
+        ticket: Ticket,
+        /// The prediction.
+        forecast: Forecast,
+        /// When its newest sample was valid.
+        valid_at: Mono,
+        /// The hand's orientation; without news of it the last one holds.
+        turn: Option<TurnForecast>,
+        /// How far the gripper is to be open, from 0 to 1; without news of it the last one holds.
+        grip: Option<f64>,
+        /// For how long.
+        lease: Lease,
+    },
+    /// Play goes on.
+    Extend {
+        /// For which engagement.
+        ticket: Ticket,
+        /// For how long.
+        lease: Lease,
+    },
+    /// The clutch is let go.
+    Release(Ticket),
+    /// Leave the latched stop.
+    Reset {
+        /// Whether an operator has authority.
+        operator: bool,
+        /// The stop that is meant, by [`Report::transitions`]; `None` is whoever stands at the arm.
+        stop: Option<u32>,
+    },
+}
+
+/// What the servo tells the session after every tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Report {
+    /// Counts ticks.
+    pub tick: u64,
+    /// When the tick began.
+    pub at: Mono,
+    /// State after it.
+    pub state: RobotState,
+    /// Why.
+    pub cause: Cause,
+    /// Counts state changes.
+    pub transitions: u32,
+    /// The engagement followed last; that of epoch 0 before the first.
+    pub engagement: Ticket,
+    /// When it began.
+    pub engaged_at: Mono,
+    /// The engagement declined last: the arm had begun to move, or a stop came first.
+    pub declined: Ticket,
+    /// Its mapping.
+    pub mapping: Mapping,
+    /// The arm still moves.
+    pub moving: bool,
+    /// Age of the newest hand state, s.
+    pub age_s: f64,
+    /// Where the tip is asked to go, m.
+    pub target_m: Vector3<f64>,
+    /// Where the filter has it, m.
+    pub reference_m: Vector3<f64>,
+    /// Tip, m.
+    pub tip_m: Vector3<f64>,
+    /// How it is oriented: tip axes to base axes.
+    pub orientation: UnitQuaternion<f64>,
+    /// The angle from there to the orientation asked for, or to the one being kept, rad.
+    pub orientation_error_rad: f64,
+    /// How far the gripper is open: 0 is closed, 1 is open.
+    pub opening: f64,
+    /// Joint positions.
+    pub q: Joints,
+    /// Ticks of this engagement on which a limit acted.
+    pub clamps: u32,
+}
+
+/// The servo's ends of the rings.
+#[derive(Debug)]
+pub struct Rings {
+    /// Orders from the session.
+    pub orders: rtrb::Consumer<Order>,
+    /// Reports to the session; dropped (and seen by their tick numbers) while it is full.
+    pub reports: rtrb::Producer<Report>,
+    /// Trajectories no longer needed, to be freed elsewhere.
+    pub spent: rtrb::Producer<Box<Trajectory>>,
+    /// Stops.
+    pub brake: Brake,
+}
+
+/// The session's ends of the rings.
+#[derive(Debug)]
+pub struct Handle {
+    /// Orders to the servo.
+    pub orders: rtrb::Producer<Order>,
+    /// Reports from it.
+    pub reports: rtrb::Consumer<Report>,
+    /// Trajectories to free.
+    pub spent: rtrb::Consumer<Box<Trajectory>>,
+    /// Stops.
+    pub brake: Brake,
+}
+
+/// A pair of ring ends: 64 orders, 4096 reports (four seconds).
+pub fn rings() -> (Rings, Handle) {
+    let (order_in, orders) = rtrb::RingBuffer::new(64);
+    let (reports, report_out) = rtrb::RingBuffer::new(4096);
+    let (spent, spent_out) = rtrb::RingBuffer::new(64);
+    let brake = Brake::default();
+    let servo = Rings {
+        orders,
+        reports,
+        spent,
+        brake: brake.clone(),
+    };
+    let session = Handle {
+        orders: order_in,
+        reports: report_out,
+        spent: spent_out,
+        brake,
+    };
+    (servo, session)
+}
