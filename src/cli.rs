@@ -43,7 +43,7 @@ enum Command {
     /// Compare mixtures for a folder of demonstrations: kinds, numbers of components, criteria.
     Select(select::Args),
     /// The operator daemon: teach, drive, play.
-    Operator(telemime_operator::cli::Args),
+    Operator(Box<telemime_operator::cli::Args>),
     /// The robot daemon: an arm that follows.
     Robot(telemime_robot::cli::Args),
     /// A UDP relay that delays, loses and throttles what passes.

@@ -1,7 +1,7 @@
 //! Which of the known skills the hand is performing, and how far it has got, sample by sample.
 //!
 //! All of it comes out of the skills as they are: the predictor's mixture is a density over the hand's
-//! states ([`known`](self)), its calibration says how strange a performance of the skill may look, and
+//! states (`known`), its calibration says how strange a performance of the skill may look, and
 //! the inferred motion is the scale on which progress is read. Nothing else has to be learned or stored.
 //!
 //! Per sample: the log density ln p(f | s) of every skill s moves a tempered Bayesian filter with a leak,
