@@ -10,9 +10,12 @@
 //! p_s ← (1 − λ)·p_s + λ/S;   p_s ← p_s · p(f | s)^(β·w) / Σ;   w = 30·min(dt, 0.1 s), λ = 1 − (1 − leak)^(30·dt)
 //! ```
 //!
-//! so that a sensor's rate changes nothing. How *strange* the sample is to s, `d²/edge` (the squared
-//! Mahalanobis distance to the nearest component over its 90 % quantile on held-out demonstrations),
-//! is averaged over 0.25 s. Beyond a threshold the motion is none of the known ones.
+//! so that a sensor's rate changes nothing. How *strange* the sample is to s is a weighted mean of two
+//! ratios, each 1 where one sample in ten of a held-out demonstration lies beyond: the squared
+//! Mahalanobis distance to the nearest component, and the squared error of what the skill foretold 200 ms
+//! ago. It is averaged over 0.3 s; beyond a threshold the motion is none of the known ones.
+//!
+//! Figures, and what did worse: `docs/recognition.md`.
 
 mod foretold;
 mod known;
@@ -55,8 +58,8 @@ pub struct RecogniseOptions {
     /// Standard deviation of the place, m, ≥ 0: how far off, along each axis, a skill may be performed
     /// from where it was learned. Infinite: anywhere.
     pub place_sd_m: f64,
-    /// The smoothed novelty, > 0, beyond which a motion is none of the known ones; 1 is the 90 % quantile
-    /// of single samples of held-out performances.
+    /// The smoothed novelty, > 0, beyond which a motion is none of the known ones; around 1 is what one
+    /// sample in ten of a held-out performance exceeds, 4 is the most there is.
     pub reject_above: f64,
     /// The tempering exponent β in (0, 1] of a sample's evidence at 30 Hz: neighbours are not independent.
     pub temper: f64,
@@ -142,7 +145,7 @@ pub struct Recognition {
     pub phase: f64,
     /// Standard deviation of the phase.
     pub phase_sd: f64,
-    /// How strange the motion is to that skill, ≥ 0; infinite without any.
+    /// How strange the motion is to that skill, 0 to 4; infinite without any.
     pub novelty: f64,
 }
 
