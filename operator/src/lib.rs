@@ -7,6 +7,7 @@ pub mod demonstration;
 pub mod ingest;
 pub mod learn;
 pub mod placed;
+pub mod recognise;
 pub mod session;
 pub mod skill_file;
 pub mod task;

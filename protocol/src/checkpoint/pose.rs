@@ -240,7 +240,7 @@ mod tests {
 
     fn turning(t_s: f64) -> UnitQuaternion<f64> {
         // Three turns about a wandering axis, with signs as a tracker may give them.
-        let q = pose::exp(&(Vector3::new(0.3 * t_s, 1.0, (2.0 * t_s).sin()) * (9.0 * t_s)));
+        let q = pose::exp(&(Vector3::new(0.3 * t_s, 1.0, libm::sin(2.0 * t_s)) * (9.0 * t_s)));
         if (t_s * 100.0) as i64 % 3 == 0 {
             UnitQuaternion::new_unchecked(-q.into_inner())
         } else {
@@ -252,7 +252,7 @@ mod tests {
         let t = times();
         let x: Vec<_> = t
             .iter()
-            .map(|t| Vector3::new(t.sin(), t.cos(), *t))
+            .map(|t| Vector3::new(libm::sin(*t), libm::cos(*t), *t))
             .collect();
         let q: Vec<_> = t.iter().map(|t| turning(*t)).collect();
         let g: Vec<_> = t

@@ -167,7 +167,7 @@ mod tests {
                 prop_assert!(a.angle_to(b) < step + 2.0 * ROTATION_STEP_RAD, "{}", a.angle_to(b));
             }
             // What was rounded once is not rounded again, as long as the axis has one sign.
-            if q.angle() < 3.14 {
+            if q.angle() < 3.1 {
                 prop_assert_eq!(WireRotation::quantise(&again.q), wire.q);
             }
         }

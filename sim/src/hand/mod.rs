@@ -55,7 +55,7 @@ pub fn swing(seed: u64, index: u32) -> Vec<(f64, [f64; 3])> {
 
 /// [`swing`] with the wrist: the same times and positions, and the orientation (w, x, y, z) of the hand in the sensor's axes.
 ///
-/// The hand rolls by a fifth of the angle by which the forearm leans from upright, and pitches and turns a little with it: as one holds a tool that an arm
+/// The hand rolls and turns a little as the forearm leans to the side, and pitches as it is raised: as one holds a tool that an arm
 /// can turn as fast, for rotation is not scaled. The tracker errs by 0.3° about each axis.
 ///
 /// ```
@@ -69,11 +69,11 @@ pub fn swing_with_wrist(seed: u64, index: u32) -> Vec<Pose> {
     frames
         .into_iter()
         .zip(leans)
-        .map(|((t_s, x), lean)| {
+        .map(|((t_s, x), [side, up])| {
             let mut err = || TRACKER_RAD * normal(&mut rng);
-            let roll = about([0.0, 0.0, 1.0], -0.2 * lean + err());
-            let pitch = about([1.0, 0.0, 0.0], 0.08 * lean + err());
-            let turn = about([0.0, 1.0, 0.0], 0.1 * lean.sin() + err());
+            let roll = about([0.0, 0.0, 1.0], -0.2 * side + err());
+            let pitch = about([1.0, 0.0, 0.0], 0.3 * (1.0 - up) + err());
+            let turn = about([0.0, 1.0, 0.0], 0.1 * side + err());
             Pose {
                 t_s,
                 x,
@@ -108,8 +108,11 @@ fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
     ]
 }
 
-/// A performance as the sensor sees it, and the forearm's true lean from upright (rad) in every frame.
-fn frames(seed: u64, index: u32) -> (Vec<(f64, [f64; 3])>, Vec<f64>) {
+/// A time, s, and a place, m.
+type Frame = (f64, [f64; 3]);
+
+/// A performance as the sensor sees it, and in every frame the true way from elbow to hand, aside and up, in forearms.
+fn frames(seed: u64, index: u32) -> (Vec<Frame>, Vec<[f64; 2]>) {
     let person = Person::new(seed);
     let mut rng = stream(seed, u64::from(index) + 1);
     let path = Performance::new(&person, index, &mut rng);
@@ -124,7 +127,7 @@ fn frames(seed: u64, index: u32) -> (Vec<(f64, [f64; 3])>, Vec<f64>) {
             return (out, leans);
         }
         let mut x = path.at(t_s);
-        leans.push((x[0] - elbow[0]).atan2(x[1] - elbow[1]));
+        leans.push([0, 1].map(|i| (x[i] - elbow[i]) / path.radius_m));
         let before = path.at(t_s - 0.5 * FRAME_S);
         let moved: f64 = (0..3).map(|i| (x[i] - before[i]).powi(2)).sum();
         // A frame's exposure smears a fast hand: the tracker errs along with its speed.
