@@ -18,6 +18,7 @@ mod prediction;
 mod processes;
 mod protocol;
 mod recognition;
+mod refinement;
 mod safety;
 mod scene;
 mod selection;
