@@ -26,7 +26,12 @@ pub(crate) struct LearnArgs {
     matching: Option<String>,
     /// Learn the motion relative to these frames too, so that they can be moved when it is played: start and goal are where
     /// a recording begins and ends; others are where its lines `# frame NAME x y z [qw qx qy qz]` say.
-    #[arg(long, value_name = "NAME,…", value_delimiter = ',', conflicts_with = "update")]
+    #[arg(
+        long,
+        value_name = "NAME,…",
+        value_delimiter = ',',
+        conflicts_with = "update"
+    )]
     frames: Vec<String>,
     /// Refine this skill; each new demonstration weighs as much as each it was learned from.
     #[arg(long, value_name = "SKILL")]
@@ -130,8 +135,8 @@ fn update(args: &LearnArgs, old: &Path) -> anyhow::Result<()> {
         d.notices()
             .iter()
             .for_each(|notice| eprintln!("note: {notice}"));
-        let (refined, what) = refine(&skill, d)
-            .with_context(|| format!("{} is unchanged", old.display()))?;
+        let (refined, what) =
+            refine(&skill, d).with_context(|| format!("{} is unchanged", old.display()))?;
         if what.is_unlike() {
             eprintln!(
                 "note: {} is unlike what {} has seen: {:.0} % of it is newer than 90 % of a usual performance; if it is another gesture, learn it as a skill of its own",

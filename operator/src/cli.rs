@@ -66,7 +66,11 @@ pub struct Args {
     pub play: Option<String>,
     /// Play: place a frame of the skill anew, m in the recordings' axes; may be repeated. The others stay where they
     /// usually were; the arm begins wherever it is, so that what counts is where the goal lies from the start.
-    #[arg(long, value_name = "NAME=x,y,z[,qw,qx,qy,qz]", conflicts_with = "replay")]
+    #[arg(
+        long,
+        value_name = "NAME=x,y,z[,qw,qx,qy,qz]",
+        conflicts_with = "replay"
+    )]
     pub frame: Vec<Placed>,
     /// Play: largest error of the rebuilt motion, m [default: 1 % of the skill's reach].
     #[arg(long, value_name = "M")]

@@ -22,7 +22,9 @@ pub struct Placed {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PlacedError {
     /// The text is no placement.
-    #[error("`{text}`: {why}; write NAME=x,y,z or NAME=x,y,z,qw,qx,qy,qz (m), for example goal=0.3,0.1,2")]
+    #[error(
+        "`{text}`: {why}; write NAME=x,y,z or NAME=x,y,z,qw,qx,qy,qz (m), for example goal=0.3,0.1,2"
+    )]
     Text {
         /// What was given.
         text: String,
@@ -36,7 +38,9 @@ pub enum PlacedError {
         name: String,
     },
     /// The skill was learned without frames.
-    #[error("{skill} was learned without frames: learn it again with `telemime learn DIR --frames start,goal`")]
+    #[error(
+        "{skill} was learned without frames: learn it again with `telemime learn DIR --frames start,goal`"
+    )]
     NoFrames {
         /// The skill.
         skill: String,
@@ -191,7 +195,14 @@ mod tests {
             (p.name.as_str(), p.turn),
             ("cup", Some(UnitQuaternion::identity()))
         );
-        for bad in ["goal", "=1,2,3", "goal=1,2", "goal=1,2,x", "goal=1,2,nan", "goal=1,2,3,1,1,1,1"] {
+        for bad in [
+            "goal",
+            "=1,2,3",
+            "goal=1,2",
+            "goal=1,2,x",
+            "goal=1,2,nan",
+            "goal=1,2,3,1,1,1,1",
+        ] {
             let error = bad.parse::<Placed>().unwrap_err().to_string();
             assert!(error.contains("write NAME=x,y,z"), "{bad}: {error}");
         }

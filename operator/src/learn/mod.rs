@@ -222,7 +222,12 @@ pub fn learn_skill(
     let task = if options.frames.is_empty() {
         None
     } else {
-        Some(frames::fit(&aligned, demonstrations, options, &mut progress)?)
+        Some(frames::fit(
+            &aligned,
+            demonstrations,
+            options,
+            &mut progress,
+        )?)
     };
     let predictor = predictor::train(
         demonstrations,

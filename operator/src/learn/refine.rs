@@ -99,11 +99,25 @@ pub fn refine(skill: &Skill, d: &Demonstration) -> Result<(Skill, Refinement), L
         let mut all = task.frames().to_vec();
         for frame in &mut all {
             let at = frames::placement(d, &frame.name)?;
-            frame.motion = updated(&frame.motion, stretch, had, &place(&at))?;
             let usual = &mut frame.usual;
+            // Which axes the frame was learned from is not kept: those in which the demonstration is likelier.
+            let own = place(&at);
+            let level = place(&frames::levelled(&at, usual));
+            let likelihood = |rows: &[Vector4<f64>]| -> f64 {
+                let then = |x: &Vector4<f64>| Vector4::new(x[0] / stretch, x[1], x[2], x[3]);
+                rows.iter()
+                    .map(|x| frame.motion.log_density(&then(x)))
+                    .sum()
+            };
+            let rows = if likelihood(&own) > likelihood(&level) {
+                let turns = [(before as f64, usual.turn), (1.0, at.turn)];
+                usual.turn = pose::mean(turns.into_iter()).unwrap_or(usual.turn);
+                own
+            } else {
+                level
+            };
             usual.origin += (at.origin - usual.origin) / one_more;
-            let turns = [(before as f64, usual.turn), (1.0, at.turn)];
-            usual.turn = pose::mean(turns.into_iter()).unwrap_or(usual.turn);
+            frame.motion = updated(&frame.motion, stretch, had, &rows)?;
         }
         parts.task = Some(TaskModel::new(all).map_err(|e| LearnError::Skill(e.into()))?);
     }
@@ -161,7 +175,11 @@ fn warped(old: &Parts, d: &Demonstration, duration_s: f64) -> Result<Vec<(f64, f
         .collect();
     let start_s = d.samples()[0].t_s;
     let pair = |(i, own_s): (usize, f64)| (at(i) * duration_s, start_s + own_s);
-    Ok(warp_to(&path, d).into_iter().enumerate().map(pair).collect())
+    Ok(warp_to(&path, d)
+        .into_iter()
+        .enumerate()
+        .map(pair)
+        .collect())
 }
 
 /// The mixture, its first coordinate stretched, after EM over `rows` beside the `had` it stands for; in units of

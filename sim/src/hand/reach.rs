@@ -5,7 +5,7 @@ use core::f64::consts::PI;
 use super::{FRAME_S, NOISE_M, normal, stream};
 
 /// Streams of their own: a person who swings is not repeated by the one who reaches.
-const REACH_STREAM: u64 = 0x7e3a_c4;
+const REACH_STREAM: u64 = 0x007e_3ac4;
 
 /// How long the hand rests before and after, s.
 const REST_S: f64 = 0.2;
@@ -39,8 +39,7 @@ pub fn reach(seed: u64, index: u32, goal: [f64; 3]) -> Vec<(f64, [f64; 3])> {
             let u = ((t_s - REST_S) / moving_s).clamp(0.0, 1.0);
             // Minimum jerk (Flash & Hogan 1985).
             let s = u * u * u * (10.0 - 15.0 * u + 6.0 * u * u);
-            let mut x: [f64; 3] =
-                core::array::from_fn(|i| start[i] + (goal[i] - start[i]) * s);
+            let mut x: [f64; 3] = core::array::from_fn(|i| start[i] + (goal[i] - start[i]) * s);
             x[1] += lift_m * (PI * u).sin().powi(2);
             // Drawn back early only: what the start of the motion looks like, wherever it leads.
             x[2] += back_m * (PI * (2.5 * u).min(1.0)).sin().powi(2);

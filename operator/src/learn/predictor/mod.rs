@@ -196,7 +196,10 @@ fn rows<C: Course>(demonstrations: &[Demonstration], knots: usize) -> Vec<Vec<Ro
 /// How many of a demonstration's samples become rows.
 pub(super) fn row_count(d: &Demonstration) -> usize {
     let mut last_s = f64::NEG_INFINITY;
-    d.samples().iter().filter(|s| kept(s.t_s, &mut last_s)).count()
+    d.samples()
+        .iter()
+        .filter(|s| kept(s.t_s, &mut last_s))
+        .count()
 }
 
 /// Whether a sample at `t_s` is far enough from the last one kept.

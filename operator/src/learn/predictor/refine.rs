@@ -159,3 +159,106 @@ fn blend(old: &Calibration, new: &Calibration, before: usize) -> Calibration {
     out.params.cv_damping += (new.params.cv_damping - old.params.cv_damping) * share;
     out
 }
+
+#[cfg(test)]
+mod tests {
+    use telemime_protocol::predict::Model;
+
+    use super::super::{Places, row_count, train};
+    use super::*;
+    use crate::demonstration::Sample;
+
+    fn trained() -> (Vec<Demonstration>, Model) {
+        let all: Vec<_> = (0..3_u32)
+            .map(|n| {
+                let own = 1.0 + 0.1 * f64::from(n);
+                let samples: Vec<_> = (0..90)
+                    .map(|i| {
+                        let t_s = f64::from(i) / 30.0;
+                        let x = Vector3::new(
+                            (2.0 * own * t_s).sin(),
+                            (3.1 * t_s).cos() * own,
+                            0.2 * (t_s * t_s).sin(),
+                        );
+                        Sample::at(t_s, x * 0.4)
+                    })
+                    .collect();
+                Demonstration::from_samples(format!("{n}"), &samples).unwrap()
+            })
+            .collect();
+        let options = PredictorOptions {
+            components: 5,
+            ..PredictorOptions::default()
+        };
+        let model = train(&all, &options, 0, &mut |_| ()).unwrap();
+        (all, model)
+    }
+
+    /// Ridge and shrinkage are undone and done again.
+    #[test]
+    fn what_regressions_give_back_makes_them_again() {
+        let (all, model) = trained();
+        let rows: usize = all.iter().map(row_count).sum();
+        let options = em_options(&PredictorOptions::default());
+        let back = blocks::recovered(model.components(), rows as f64, &options);
+        let counted: f64 = back.iter().map(|b| b.n).sum();
+        assert!((counted - rows as f64).abs() < 1e-6, "{counted} of {rows}");
+        let scaling = Scaling {
+            features: model.standardisation().clone(),
+            target_mean: [0.0; TARGETS],
+            target_scale: [1.0; TARGETS],
+        };
+        let again = blocks::of_blocks(back, &scaling, &options).unwrap();
+        for (a, b) in model.components().iter().zip(&again) {
+            assert!((a.weight - b.weight).abs() < 1e-12);
+            assert!((a.factor - b.factor).abs().max() < 1e-9);
+            assert!((a.mean - b.mean).norm() < 1e-12);
+            let pairs = a.gain.iter().flatten().zip(b.gain.iter().flatten());
+            assert!(pairs.clone().all(|(a, b)| (a - b).abs() < 1e-9));
+            let pairs = a.residual.iter().flatten().zip(b.residual.iter().flatten());
+            assert!(pairs.clone().all(|(a, b)| (a - b).abs() < 1e-9));
+        }
+    }
+
+    /// Rows that the old mixture assigns as EM did are worth what they would have been in training.
+    #[test]
+    fn blocks_joined_are_blocks_of_both() {
+        let (all, model) = trained();
+        let scaling = Scaling {
+            features: model.standardisation().clone(),
+            target_mean: [0.0; TARGETS],
+            target_scale: [1.0; TARGETS],
+        };
+        let rows: Vec<Row> = rows_of::<Places>(&all[0], 24, &UnitQuaternion::identity())
+            .iter()
+            .map(|row| scale_row(row, &scaling))
+            .collect();
+        let shares: Vec<f64> = (0..rows.len()).map(|i| 0.2 + 0.01 * i as f64).collect();
+        let whole = Blocks::of(&rows, shares.iter());
+        let mut joined = Blocks::of(&rows[..30], shares[..30].iter());
+        joined.join(&Blocks::of(&rows[30..], shares[30..].iter()));
+        assert!((whole.n - joined.n).abs() < 1e-9);
+        for knot in 0..24 {
+            for (a, b) in whole.yy[knot].iter().zip(&joined.yy[knot]) {
+                assert!((a - b).abs() < 1e-9 * whole.n);
+            }
+        }
+        for (a, b) in whole.target_mean.iter().zip(&joined.target_mean) {
+            assert!((a - b).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn the_first_trial_replaces_guesses_and_later_ones_count_alike() {
+        let guess = Calibration::UNTRIED;
+        let mut seen = guess;
+        seen.covariance = [0.5; MAX_KNOTS];
+        seen.novelty90 = 1e6;
+        seen.params.trust = 0.4;
+        assert_eq!(blend(&guess, &seen, 1).covariance[3], 0.5);
+        let later = blend(&guess, &seen, 3);
+        assert!((later.params.trust - (0.75 * guess.params.trust + 0.1)).abs() < 1e-12);
+        // A demonstration of something else does not make everything familiar.
+        assert!(later.novelty90 <= guess.novelty90 * 1.75 + 1e-9);
+    }
+}
