@@ -111,11 +111,18 @@ fn a_moved_goal_is_reached_from_its_own_start() {
             assert!(reached < bar_m && begun < bar_m, "{reached} {begun}");
             assert!(missed > 5.0 * reached);
             assert!(with < 0.015 && with < 0.2 * without, "{with} {without}");
-            // The shape is kept near the start: drawn back and up as demonstrated, relative to it.
+            // Early on the motion is the one seen from the start, drawn back and up, wherever it leads.
             let early_s = 0.2 * learned.duration_s;
-            let (shape, shown) = (placed(early_s) - placed(0.0), plain(early_s) - plain(0.0));
-            let apart = (shape - shown).norm();
-            assert!(apart < 0.025, "{shape} {shown}: {apart} m");
+            let from_start = Gmr::<1, 3>::new(&learned.task.frames()[0].motion).unwrap();
+            let shape = from_start.query(&SVector::from([early_s])).mean;
+            let apart = (placed(early_s) - at[0].origin - shape).norm();
+            println!(
+                "  {:.1} mm off the start's own view after a fifth of the time, {:.0} mm away",
+                apart * 1e3,
+                shape.norm() * 1e3
+            );
+            // Little of how far the goal has moved.
+            assert!(apart < 0.15 * missed, "{apart} m of {missed}");
         }
     }
 }
