@@ -1,9 +1,10 @@
 //! Motions relative to frames: a moved goal is reached, a held-out performance foretold from its own ends.
 
-use nalgebra::{SVector, Vector3};
+use nalgebra::{SVector, UnitQuaternion, Vector3};
 use telemime_operator::demonstration::{Demonstration, Demonstrations, Sample};
 use telemime_operator::learn::frames::{GOAL, START, placement};
-use telemime_operator::learn::{LearnOptions, align, frames, motion};
+use telemime_operator::learn::{LearnOptions, align, frames, learn_skill, motion};
+use telemime_operator::placed::{Motion, Placed};
 use telemime_protocol::skill::{Gmm, Gmr, Placement, TaskModel};
 use telemime_sim::hand::reach;
 
@@ -125,6 +126,58 @@ fn a_moved_goal_is_reached_from_its_own_start() {
             assert!(apart < 0.15 * missed, "{apart} m of {missed}");
         }
     }
+}
+
+/// What is asked for is a goal turned by a quarter: its last centimetres and the hand turn with it, the start does not.
+#[test]
+fn a_turned_goal_is_approached_from_the_turned_side() {
+    let demonstrations: Vec<_> = (0..5)
+        .map(|i| {
+            let d = performance(i, corner(i));
+            let end_s = d.last().t_s;
+            let posed = |s: &Sample| Sample {
+                orientation: Some(UnitQuaternion::from_euler_angles(
+                    0.2,
+                    1.1 * s.t_s / end_s,
+                    0.0,
+                )),
+                ..*s
+            };
+            let samples: Vec<_> = d.samples().iter().map(posed).collect();
+            Demonstration::from_samples(d.name(), &samples).unwrap()
+        })
+        .collect();
+    let options = LearnOptions {
+        frames: vec![START.to_owned(), GOAL.to_owned()],
+        ..LearnOptions::default()
+    };
+    let skill = learn_skill("reach", &demonstrations, &options, |_| ()).unwrap();
+    let usual = skill.task().unwrap().frames()[1].usual;
+    let quarter = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
+    let goal = |turn| Placed {
+        name: GOAL.to_owned(),
+        origin: usual.origin,
+        turn,
+    };
+    let straight = Motion::new(&skill, &[goal(None)]).unwrap();
+    let turned = Motion::new(&skill, &[goal(Some(quarter * usual.turn))]).unwrap();
+    let end_s = skill.duration_s();
+    let hand = turned.turn_at(end_s).unwrap();
+    assert!(hand.angle_to(&(quarter * usual.turn)) < 0.05);
+    let first = turned.turn_at(0.0).unwrap();
+    assert!(first.angle_to(&straight.turn_at(0.0).unwrap()) < 0.05);
+    // Down from above, 5 cm or so before the end, becomes sideways.
+    let near_s = 0.8 * end_s;
+    let way = |m: &Motion| m.at(near_s).mean - usual.origin;
+    let (from, to) = (way(&straight), way(&turned));
+    println!(
+        "{:.0} mm before the goal: {:.1} mm off the turned way",
+        from.norm() * 1e3,
+        (quarter * from - to).norm() * 1e3
+    );
+    assert!(from.norm() > 0.03 && (quarter * from - to).norm() < 0.3 * from.norm());
+    assert!((turned.at(end_s).mean - usual.origin).norm() < 0.006);
+    assert!((turned.at(0.0).mean - straight.at(0.0).mean).norm() < 0.006);
 }
 
 /// Bars: what was measured, and a tenth.
