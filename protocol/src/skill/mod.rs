@@ -6,6 +6,7 @@ mod example;
 mod file;
 pub(crate) mod gmm;
 mod gmr;
+mod predictor;
 mod task;
 mod turn;
 
