@@ -126,12 +126,8 @@ mod tests {
         let found = phases(&reference, &path, 25);
         let (least, greatest) = paces(&found);
         assert!(least > 0.2 && greatest < 4.01, "{least} {greatest}");
-        for i in 15..65 {
-            assert!(
-                (found[i] - i as f64 - 20.0).abs() < 4.0,
-                "{i}: {}",
-                found[i]
-            );
+        for (i, phase) in found.iter().enumerate().take(65).skip(15) {
+            assert!((phase - i as f64 - 20.0).abs() < 4.0, "{i}: {phase}");
         }
     }
 
