@@ -11,7 +11,7 @@ use telemime_endpoint::cli::{self as shell, one_line};
 use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
 
 use crate::relay::{Passage, Relay, RelayConfig};
-use crate::{demo, ingest, paper, select, teach};
+use crate::{demo, ingest, paper, recognise, select, teach};
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
 /// network delay behind it.
@@ -36,6 +36,12 @@ enum Command {
     Learn(teach::LearnArgs),
     /// Show what a saved skill holds.
     Inspect(teach::InspectArgs),
+    /// List the skills there are.
+    List(recognise::ListArgs),
+    /// Say which skill a recording shows, moment by moment, or that it is none of them.
+    Recognise(recognise::RecogniseArgs),
+    /// Try recognition on demonstrations held out: which skills are confused, what is refused.
+    Confusion(recognise::ConfusionArgs),
     /// Compare mixtures for a folder of demonstrations: kinds, numbers of components, criteria.
     Select(select::Args),
     /// The operator daemon: teach, drive, play.
@@ -105,6 +111,9 @@ pub fn main() -> ExitCode {
         Some(Command::Import(args)) => ingest::run(args),
         Some(Command::Learn(args)) => teach::learn(args),
         Some(Command::Inspect(args)) => teach::inspect(args),
+        Some(Command::List(args)) => recognise::list(args),
+        Some(Command::Recognise(args)) => recognise::recognise(args),
+        Some(Command::Confusion(args)) => recognise::confusion(args),
         Some(Command::Select(args)) => select::run(args),
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),

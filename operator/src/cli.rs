@@ -336,6 +336,7 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         // A second before now, so that a sensor's latency may be subtracted from the first sample.
         epoch: Mono(clock.now().0 - 1_000_000_000),
         skill: skills.mirror(),
+        recogniser: skills.recogniser(&log),
         config,
         patience: Duration::from_secs_f64(args.patience.unwrap_or(10.0).clamp(0.1, 3600.0)),
     };

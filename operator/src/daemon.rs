@@ -20,6 +20,7 @@ use telemime_protocol::wire::v1;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{sleep_until, timeout};
 
+use crate::recognise::Recogniser;
 use crate::session::{Counters, Event, Output, Session, SessionConfig};
 use crate::task::{Advice, Outcome, Task};
 
@@ -45,6 +46,8 @@ pub struct Daemon {
     pub epoch: Mono,
     /// What to predict with.
     pub skill: Option<Arc<Skill>>,
+    /// Says which skill the hand performs, if anybody wants to know.
+    pub recogniser: Option<Recogniser>,
     /// Session settings.
     pub config: SessionConfig,
     /// Give up if the first connection takes longer than this.
@@ -210,7 +213,8 @@ impl Daemon {
             let Some(link) = link else { break };
             summary.sessions += 1;
             let _ = notices.send(Notice::Connected { epoch: link.epoch });
-            let mut session = Session::new(self.config, self.skill.clone(), link.epoch);
+            let mut session = Session::new(self.config, self.skill.clone(), link.epoch)
+                .watched_by(self.recogniser.clone());
             marks.requests = 0;
             if stop {
                 session.stop(self.now());

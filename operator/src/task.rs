@@ -174,7 +174,7 @@ impl Task {
             Event::State(RobotState::Ready, Cause::PlanFinished) => {
                 self.phase = Phase::Leaving(now.offset_by_secs(LEAVE_S));
             }
-            Event::Ready | Event::State(..) | Event::Telemetry(_) => {}
+            Event::Ready | Event::State(..) | Event::Recognised { .. } | Event::Telemetry(_) => {}
         }
     }
 

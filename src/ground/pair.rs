@@ -262,6 +262,7 @@ impl Pair {
             clock: self.clock,
             epoch: SESSION_ZERO,
             skill,
+            recogniser: None,
             config,
             patience: Duration::from_secs(5),
         };

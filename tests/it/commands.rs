@@ -4,8 +4,19 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 9] = [
-    "demo", "import", "learn", "inspect", "select", "robot", "operator", "link", "paper",
+const COMMANDS: [&str; 12] = [
+    "demo",
+    "import",
+    "learn",
+    "inspect",
+    "list",
+    "recognise",
+    "confusion",
+    "select",
+    "robot",
+    "operator",
+    "link",
+    "paper",
 ];
 
 fn document(name: &str) -> String {

@@ -17,6 +17,7 @@ mod play;
 mod prediction;
 mod processes;
 mod protocol;
+mod recognition;
 mod safety;
 mod scene;
 mod selection;

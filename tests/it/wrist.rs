@@ -122,7 +122,8 @@ fn a_turning_hand_is_mirrored_ahead_of_its_link() {
     let floor = error(&floor.turn.unwrap());
     println!("orientation: predicted {predicted:.4} rad, delayed {delayed:.4}, floor {floor:.4}");
     assert!(predicted < 0.7 * delayed, "{predicted} of {delayed} rad");
-    assert!(floor < predicted, "nobody knows better than the truth");
+    // The truth has the tracker's noise in it, which costs the arm more than what a prediction leaves out.
+    assert!(predicted < 1.2 * floor, "{predicted} rad, {floor} rad");
 
     // The gripper follows what the hand does, the link's delay and its own speed later.
     let opening = |t_s: f64| {

@@ -11,6 +11,7 @@ use tokio::sync::mpsc;
 use super::played::Played;
 use crate::daemon::{Notice, Summary};
 use crate::learn::align::Aligned;
+use crate::recognise::Verdict;
 use crate::session;
 use crate::task::{Outcome, Task};
 
@@ -177,6 +178,13 @@ pub enum Event {
         cause: String,
         mono_ns: i64,
     },
+    Recognised {
+        what: String,
+        skill: Option<String>,
+        probability: f64,
+        phase: f64,
+        mono_ns: i64,
+    },
     Progress {
         done: f64,
     },
@@ -292,6 +300,18 @@ impl Event {
             Self::Refused { reason } if reason == "ClockUnknown" => return None,
             Self::Refused { reason } => format!("the robot declines: {reason}"),
             Self::State { state, cause, .. } => format!("robot: {state} ({cause})"),
+            Self::Recognised {
+                skill: Some(skill),
+                probability,
+                phase,
+                ..
+            } => format!(
+                "hand: {skill} ({:.0} %), {:.0} % of the way",
+                probability * 1e2,
+                phase * 1e2
+            ),
+            Self::Recognised { what, .. } if what == "none of these" => format!("hand: {what}"),
+            Self::Recognised { .. } => return None,
             Self::Progress { .. } | Self::Telemetry { .. } => return None,
             Self::Played {
                 samples,
@@ -421,6 +441,26 @@ pub(super) async fn listen_to(
                     cause: format!("{cause:?}"),
                     mono_ns: at.0 + epoch.0,
                 },
+                session::Event::Recognised {
+                    verdict,
+                    skill,
+                    probability,
+                    phase,
+                } => {
+                    let what = match verdict {
+                        Verdict::Resting => "resting",
+                        Verdict::Unknown => "none of these",
+                        Verdict::Undecided => "undecided",
+                        Verdict::Skill(_) => "skill",
+                    };
+                    Event::Recognised {
+                        what: what.to_owned(),
+                        skill,
+                        probability,
+                        phase,
+                        mono_ns: at.0 + epoch.0,
+                    }
+                }
                 session::Event::Telemetry(t) => {
                     let uncertainty_ms = f64::from(t.clock_uncertainty_us) * 1e-3;
                     bar.set_message(format!(

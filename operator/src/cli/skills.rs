@@ -11,6 +11,7 @@ use super::report::{Event, Log};
 use crate::demonstration::{Demonstration, Demonstrations};
 use crate::learn::align::{Aligned, align};
 use crate::learn::{LearnOptions, Progress, learn_skill};
+use crate::recognise::{RecogniseOptions, Recogniser};
 use crate::skill_file;
 
 /// Components of one mixture per skill when several share it (prediction.md §1).
@@ -100,6 +101,21 @@ impl Skills {
     /// The model to mirror with, if there is any.
     pub fn mirror(&self) -> Option<Arc<Skill>> {
         self.mirror.clone()
+    }
+
+    /// What tells the skills apart, for display; `None` where there is nothing to tell.
+    pub(super) fn recogniser(&self, log: &Log) -> Option<Recogniser> {
+        if self.all.is_empty() {
+            return None;
+        }
+        let skills = self.all.iter().map(AsRef::as_ref);
+        match Recogniser::new(skills, RecogniseOptions::default()) {
+            Ok(recogniser) => Some(recogniser),
+            Err(e) => {
+                log.note(&format!("skills are not recognised: {e}"));
+                None
+            }
+        }
     }
 
     /// The demonstrations a skill was learned from just now, on one time axis.

@@ -23,6 +23,8 @@ use telemime_protocol::wire::v1::{
     Drive, Engage, Info, Message, OperatorControl, OperatorDatagram, PathTail, Refusal, RobotState,
 };
 
+use crate::recognise::{Recogniser, Verdict};
+
 pub use config::{FutureBound, HandSample, SessionConfig, default_scale};
 pub use said::{Counters, Event, Output};
 
@@ -55,6 +57,8 @@ pub struct Session {
     state: RobotState,
     changes: u32,
     hand: Option<Hand>,
+    recogniser: Option<Recogniser>,
+    verdict: Option<Verdict>,
     activity: Activity,
     engagement: u32,
     seq: u32,
@@ -83,6 +87,8 @@ impl Session {
             state: RobotState::Idle,
             changes: 0,
             hand: None,
+            recogniser: None,
+            verdict: None,
             activity: Activity::Nothing,
             engagement: 0,
             seq: 0,
@@ -96,6 +102,14 @@ impl Session {
             outputs: VecDeque::new(),
             events: VecDeque::new(),
         }
+    }
+
+    /// Reports with [`Event::Recognised`] which of these skills the hand performs, whenever that changes. It
+    /// changes nothing else.
+    #[must_use]
+    pub fn watched_by(mut self, recogniser: Option<Recogniser>) -> Self {
+        self.recogniser = recogniser;
+        self
     }
 
     /// What the robot said of itself.
@@ -153,6 +167,8 @@ impl Session {
             self.counters.dropped += 1;
             return;
         }
+        let hand = *hand;
+        self.recognise(&hand);
         let Activity::Mirror(mirror) = &mut self.activity else {
             return;
         };
@@ -163,8 +179,7 @@ impl Session {
         } else {
             self.counters.samples += 1;
         }
-        self.counters.knots +=
-            u32::from(mirror.take(&previous, *hand, skill, self.delay_s + lag_s));
+        self.counters.knots += u32::from(mirror.take(&previous, hand, skill, self.delay_s + lag_s));
         let backlog = mirror.backlog();
         let arrival = now.offset_by_secs(self.delay_s + lag_s);
         let silent_s = now.secs_since(self.last_sent);
@@ -180,6 +195,29 @@ impl Session {
         if let Some(tail) = backlog {
             self.path(tail);
         }
+    }
+
+    fn recognise(&mut self, hand: &Hand) {
+        let Some(recogniser) = &mut self.recogniser else {
+            return;
+        };
+        let Some(seen) = recogniser.take(&hand.place) else {
+            return;
+        };
+        if self.verdict == Some(seen.verdict) {
+            return;
+        }
+        self.verdict = Some(seen.verdict);
+        let skill = match seen.verdict {
+            Verdict::Skill(index) => recogniser.names().get(index).cloned(),
+            Verdict::Resting | Verdict::Unknown | Verdict::Undecided => None,
+        };
+        self.events.push_back(Event::Recognised {
+            verdict: seen.verdict,
+            skill,
+            probability: seen.probability,
+            phase: seen.phase,
+        });
     }
 
     /// Asks the robot to follow the hand; refused here if no sample has been taken yet, or a stop is under way.

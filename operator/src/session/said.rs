@@ -1,5 +1,6 @@
 //! What a session says: bytes to send, events, counts.
 
+use crate::recognise::Verdict;
 use nalgebra::UnitQuaternion;
 use telemime_protocol::wire::v1::{Cause, Refusal, RobotState, Telemetry};
 
@@ -41,6 +42,17 @@ pub enum Event {
     Refused(Refusal),
     /// The robot's state changed.
     State(RobotState, Cause),
+    /// The hand does something else than before; for display.
+    Recognised {
+        /// What.
+        verdict: Verdict,
+        /// The skill's name, if it is one.
+        skill: Option<String>,
+        /// How probable that is, in [0, 1].
+        probability: f64,
+        /// How far it has got, in [0, 1].
+        phase: f64,
+    },
     /// News of the robot.
     Telemetry(Box<Telemetry>),
 }

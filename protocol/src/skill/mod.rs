@@ -7,6 +7,7 @@ mod example;
 mod file;
 pub(crate) mod gmm;
 mod gmr;
+mod predictor;
 mod task;
 mod turn;
 
@@ -19,9 +20,9 @@ use sha2::{Digest, Sha256};
 use crate::predict::{Model, ModelError, TurnModel};
 use crate::wire::codec::DecodeError;
 
+pub use confidence::{chi_squared_cdf, chi_squared_quantile};
 #[cfg(any(test, feature = "testing"))]
 pub use example::{example, posed_example};
-pub use confidence::{chi_squared_cdf, chi_squared_quantile};
 pub use file::FileError;
 pub use gmm::{Component, Gmm, GmmError, MAX_COMPONENTS};
 pub use gmr::{Gmr, GmrError, Moving, Regressed};

@@ -3,7 +3,8 @@ use proptest::prelude::*;
 
 use super::example::{example, example_model, posed_example};
 use super::*;
-use crate::predict::{Calibration, Regression, Standardisation};
+use crate::predict::{Calibration, HandState, Regression, Standardisation};
+use crate::time::Stamp;
 
 #[test]
 fn a_skill_is_what_its_bytes_say() {
@@ -170,6 +171,37 @@ fn a_model_with_a_bad_number_is_refused() {
         Model::new(25, s, c, *good.calibration()),
         Err(E::Knots { found: 25 })
     ));
+}
+
+/// A step is two hundredths of what remains unexplained at most: predictions change by no more than that.
+#[test]
+fn rounding_a_predictor_costs_it_nothing() {
+    let raw = example_model(14, 24);
+    let parts = Parts {
+        predictor: raw.clone(),
+        ..example(14, 24).parts().clone()
+    };
+    let skill = Skill::new(parts).unwrap();
+    assert!(
+        skill.to_bytes().len() < 40_000,
+        "{} B",
+        skill.to_bytes().len()
+    );
+    let mut state = HandState::first(Stamp(0), Vector3::new(0.1, 0.2, 0.3));
+    for i in 1..60 {
+        let u = f64::from(i);
+        let x = Vector3::new(libm::sin(0.3 * u), libm::cos(0.2 * u), 0.01 * u);
+        state.advance(Stamp(i64::from(i) * 31_000_000), x);
+        let (a, b) = (raw.posterior(&state), skill.predictor().posterior(&state));
+        for j in 0..24 {
+            let off = (a.displacement[j] - b.displacement[j]).norm();
+            let sigma = a.covariance[j].trace().sqrt();
+            // The steps are per standardised feature: a strange state is a multiple of them off.
+            let strange = 1.0 + a.novelty.sqrt();
+            assert!(off < 0.02 * sigma * strange, "{off} of {sigma} at knot {j}");
+        }
+        assert!((a.novelty / b.novelty - 1.0).abs() < 0.02);
+    }
 }
 
 proptest! {

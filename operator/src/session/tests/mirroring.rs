@@ -7,6 +7,8 @@ use telemime_protocol::predict::{Forecast, checksum};
 use telemime_protocol::wire::knots;
 use telemime_protocol::wire::v1::model_tag;
 
+use crate::recognise::{RecogniseOptions, Recogniser, Verdict};
+
 fn bound(bound_m: f64) -> SessionConfig {
     SessionConfig {
         future_bound: FutureBound::Absolute(bound_m),
@@ -44,6 +46,35 @@ fn a_request_carries_the_hand_and_the_mapping() {
     assert_eq!((*model, state.t), (tag, bench.now));
     assert!((state.x - home() - Vector3::x() * 0.05).norm() < 1e-4);
     assert!(bench.datagrams.is_empty());
+}
+
+#[test]
+fn what_the_hand_does_is_told_when_it_changes_and_changes_nothing_else() {
+    let run = |watched: bool| {
+        let skill = example(2, 24);
+        let recogniser = Recogniser::new([&skill], RecogniseOptions::default()).unwrap();
+        let mut bench = Bench::ready(bound(0.02), Some(skill));
+        bench.session = bench.session.watched_by(watched.then_some(recogniser));
+        for _ in 0..20 {
+            bench.sample(home());
+        }
+        for i in 0..30 {
+            bench.sample(home() + Vector3::x() * (0.05 * f64::from(i)));
+        }
+        let told = bench.events.iter().filter_map(|e| match e {
+            Event::Recognised { verdict, skill, .. } => Some((*verdict, skill.clone())),
+            _ => None,
+        });
+        (
+            told.collect::<Vec<_>>(),
+            bench.datagrams.clone(),
+            bench.control.clone(),
+        )
+    };
+    let (told, datagrams, control) = run(true);
+    // A hand that flies off is none of the skills; it is said once.
+    assert_eq!(told, [(Verdict::Resting, None), (Verdict::Unknown, None)]);
+    assert_eq!(run(false), (Vec::new(), datagrams, control));
 }
 
 #[test]
