@@ -77,12 +77,16 @@ pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
     }
     let mut degenerate = Vec::new();
     let mut still = Vec::new();
+    let mut spread_m = (0.0, 0.0);
     let skill = learn_skill(&found.name, &found.demonstrations, &options, |progress| {
-        if let Progress::Motion {
-            degenerate: found, ..
-        } = &progress
-        {
-            degenerate.clone_from(found);
+        match &progress {
+            Progress::Motion {
+                degenerate: found, ..
+            } => degenerate.clone_from(found),
+            Progress::Aligned {
+                before_m, after_m, ..
+            } => spread_m = (*before_m, *after_m),
+            _ => {}
         }
         if let Progress::Frame { name, spread_m, .. } = &progress
             && *spread_m < LEAST_SPREAD_M
@@ -115,6 +119,13 @@ pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
         .unwrap_or_else(|| PathBuf::from(format!("{}.skill", skill.name())));
     skill_file::save(&skill, &path)?;
     describe(&skill);
+    if found.demonstrations.len() > 1 {
+        say!(
+            "  demonstrations: {:.4} m from their mean in proportional time, {:.4} m aligned",
+            spread_m.0,
+            spread_m.1
+        );
+    }
     say!("saved to {}", path.display());
     Ok(())
 }
@@ -226,6 +237,13 @@ fn describe(skill: &Skill) {
             q.k
         );
     }
+    let pace = |p| skill.pace().quantile_s(p).unwrap_or(f64::NAN);
+    say!(
+        "  pace: performed in {:.3} s, nine times of ten in {:.3} to {:.3} s",
+        pace(0.5),
+        pace(0.05),
+        pace(0.95)
+    );
     say!(
         "  predictor: {} components over the hand's state, {} knots to {:.2} s",
         predictor.components().len(),

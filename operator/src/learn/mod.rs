@@ -14,8 +14,10 @@ mod stats;
 #[cfg(test)]
 mod tests;
 mod trial;
+pub mod tube;
 pub mod turn;
 pub mod variational;
+mod warp;
 
 use std::path::PathBuf;
 
@@ -158,6 +160,10 @@ pub enum Progress {
         medoid: String,
         /// Mean duration, s.
         duration_s: f64,
+        /// How far the demonstrations are from their mean in proportional time, m (see [`tube`]).
+        before_m: f64,
+        /// How far aligned, m.
+        after_m: f64,
     },
     /// A number of components was tried for the motion.
     Candidate(select::Candidate),
@@ -214,9 +220,12 @@ pub fn learn_skill(
         });
     }
     let aligned = align::align(demonstrations)?;
+    let tubes = tube::BeforeAfter::of(demonstrations, &aligned);
     progress(Progress::Aligned {
         medoid: demonstrations[aligned.medoid].name().to_owned(),
         duration_s: aligned.duration_s,
+        before_m: tubes.before.deviation_m(),
+        after_m: tubes.after.deviation_m(),
     });
     let motion = motion::fit(&aligned, options, &mut progress)?;
     let task = if options.frames.is_empty() {

@@ -1,6 +1,7 @@
 //! What a skill is: a motion to play, a predictor to mirror with, and where both came from.
 
 mod bytes;
+mod confidence;
 #[cfg(any(test, feature = "testing"))]
 mod example;
 mod file;
@@ -19,11 +20,12 @@ use sha2::{Digest, Sha256};
 use crate::predict::{Model, ModelError, TurnModel};
 use crate::wire::codec::DecodeError;
 
+pub use confidence::{chi_squared_cdf, chi_squared_quantile};
 #[cfg(any(test, feature = "testing"))]
 pub use example::{example, posed_example};
 pub use file::FileError;
 pub use gmm::{Component, Gmm, GmmError, MAX_COMPONENTS};
-pub use gmr::{Gmr, GmrError, Regressed};
+pub use gmr::{Gmr, GmrError, Moving, Regressed};
 pub use task::{MAX_FRAMES, Placement, TaskError, TaskFrame, TaskModel};
 pub use turn::{RegressedTurn, TurnError, TurnMixture};
 
@@ -78,6 +80,17 @@ pub struct Pace {
     pub mean_ln_s: f64,
     /// Its standard deviation, > 0.
     pub deviation_ln: f64,
+}
+
+impl Pace {
+    /// The duration that a share `p` of performances stays below, s: its median at 0.5. `None` unless
+    /// 0 < p < 1.
+    pub fn quantile_s(&self, p: f64) -> Option<f64> {
+        // A squared standard normal has one degree of freedom.
+        let z = chi_squared_quantile((2.0 * p - 1.0).abs(), 1)?.sqrt();
+        let z = if p < 0.5 { -z } else { z };
+        Some(libm::exp(self.mean_ln_s + z * self.deviation_ln))
+    }
 }
 
 /// How much a skill has seen, so that a further demonstration weighs what it should.
