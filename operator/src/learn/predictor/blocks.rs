@@ -174,7 +174,7 @@ pub(super) fn recovered(regressions: &[Regression], rows: f64, options: &EmOptio
     }
     for b in &mut blocks {
         b.combine(1.0, &tied, -options.shrinkage);
-        // What rounding to single precision left of a scatter that was nothing.
+        // What the rounding of an encoded skill left of a scatter that was nothing.
         for yy in &mut b.yy {
             for d in [0, 3, 5] {
                 yy[d] = yy[d].max(0.0);
