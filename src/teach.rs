@@ -341,6 +341,19 @@ fn describe(skill: &Skill) {
         skill.duration_s(),
         skill.motion().components().len()
     );
+    if let Some(turn) = skill.turn() {
+        say!(
+            "  orientation: {} components over (t, rotation); predictor of {}",
+            turn.motion.charts().len(),
+            turn.predictor.charts().len()
+        );
+    }
+    if let Some(grip) = skill.grip() {
+        say!(
+            "  gripper: {} components over (t, opening)",
+            grip.components().len()
+        );
+    }
     for frame in skill.task().iter().flat_map(|task| task.frames()) {
         let (o, q) = (frame.usual.origin, frame.usual.turn);
         say!(
