@@ -38,7 +38,7 @@ impl Refinement {
 /// Refines `skill` with one demonstration more.
 ///
 /// It is warped onto the skill's own regression, and each mixture over time goes on with EM, its components
-/// standing for the rows they explained ([`em::update`]). The predictor's regressions give back the scatters they were
+/// standing for the rows they explained ([`em::update()`]). The predictor's regressions give back the scatters they were
 /// made of. The number of components stays, and so does the seed; a demonstration weighs as much as each before.
 ///
 /// # Errors
