@@ -192,7 +192,8 @@ impl<'a> Warp<'a> {
     /// it; strictly ascending, from the first to the last point.
     fn phases(&self) -> Vec<f64> {
         let band = (BAND * self.a.len() as f64).ceil() as usize;
-        warp::phases(self.a, self.b, band)
+        let unlike_m2 = self.cost / self.a.len() as f64;
+        warp::phases(self.a, self.b, band, unlike_m2)
     }
 }
 

@@ -22,8 +22,14 @@ const SMOOTHINGS: usize = 4;
 
 /// For each point of `reference` the (fractional) point of `path` that belongs to it, strictly ascending from
 /// the first to the last; both have the same number of points, at least two. No phase strays from proportional
-/// time by more than `band` points.
-pub(super) fn phases(reference: &[Vector3<f64>], path: &[Vector3<f64>], band: usize) -> Vec<f64> {
+/// time by more than `band` points. `unlike_m2` is by how much the two differ whatever their timing, a mean square: what
+/// is that different (reaches for other goals) is no measure of pace, so warping costs that much more.
+pub(super) fn phases(
+    reference: &[Vector3<f64>],
+    path: &[Vector3<f64>],
+    band: usize,
+    unlike_m2: f64,
+) -> Vec<f64> {
     let n = reference.len();
     let last = (n - 1) * FINE;
     let fine: Vec<_> = (0..=last)
@@ -43,7 +49,7 @@ pub(super) fn phases(reference: &[Vector3<f64>], path: &[Vector3<f64>], band: us
     let price: Vec<f64> = (0..=FASTEST * FINE)
         .map(|step| match step {
             0 => f64::INFINITY,
-            _ => STIFFNESS * size * (step as f64 / FINE as f64).ln().powi(2),
+            _ => (STIFFNESS * size + unlike_m2) * (step as f64 / FINE as f64).ln().powi(2),
         })
         .collect();
 
@@ -103,7 +109,7 @@ mod tests {
     #[test]
     fn a_path_is_its_own_warp() {
         let path = curve(60, |u| u);
-        for (i, phase) in phases(&path, &path, 15).into_iter().enumerate() {
+        for (i, phase) in phases(&path, &path, 15, 0.0).into_iter().enumerate() {
             assert_eq!(phase, i as f64);
         }
     }
@@ -111,7 +117,7 @@ mod tests {
     #[test]
     fn a_known_warp_is_found() {
         let (reference, path) = (curve(100, |u| u), curve(100, |u| u * (0.6 + 0.4 * u)));
-        for (i, phase) in phases(&reference, &path, 25).into_iter().enumerate() {
+        for (i, phase) in phases(&reference, &path, 25, 0.0).into_iter().enumerate() {
             let (u, own) = (i as f64 / 99.0, phase / 99.0);
             assert!((own * (0.6 + 0.4 * own) - u).abs() < 0.015, "{i}: {phase}");
         }
@@ -123,7 +129,7 @@ mod tests {
         let rest = |u: f64, from: f64, to: f64| ((u - from) / (to - from)).clamp(0.0, 1.0);
         let reference = curve(100, |u| rest(u, 0.1, 0.7));
         let path = curve(100, |u| rest(u, 0.3, 0.9));
-        let found = phases(&reference, &path, 25);
+        let found = phases(&reference, &path, 25, 0.0);
         let (least, greatest) = paces(&found);
         assert!(least > 0.2 && greatest < 4.01, "{least} {greatest}");
         for (i, phase) in found.iter().enumerate().take(65).skip(15) {
@@ -143,14 +149,14 @@ mod tests {
                 *v += 0.04 * ((state >> 33) as f64 / (1_u64 << 31) as f64 - 0.5);
             }
         }
-        let (least, greatest) = paces(&phases(&curve(100, |u| u), &noisy, 25));
+        let (least, greatest) = paces(&phases(&curve(100, |u| u), &noisy, 25, 0.0));
         assert!(least > 0.7 && greatest < 1.4, "{least} {greatest}");
     }
 
     #[test]
     fn a_hand_that_rests_throughout_is_not_warped() {
         let still = vec![Vector3::new(1.0, 2.0, 3.0); 30];
-        let found = phases(&still, &still, 8);
+        let found = phases(&still, &still, 8, 0.0);
         let even: Vec<f64> = (0..30).map(f64::from).collect();
         assert_eq!(found, even);
     }
