@@ -10,6 +10,8 @@ use telemime_operator::placed::{Motion, Placed};
 use telemime_operator::skill_file;
 use telemime_protocol::skill::Skill;
 
+use crate::picture::{self, Subject};
+
 /// Learn a skill from a folder of demonstrations (CSV: t,x,y,z; one file each) and save it.
 ///
 /// With --update, refine a saved skill by further demonstrations, without those it was learned from.
@@ -39,6 +41,12 @@ pub(crate) struct LearnArgs {
     /// Seed of every random choice.
     #[arg(long, default_value_t = 0, conflicts_with = "update")]
     seed: u64,
+    /// Draw what was learned: demonstrations, Gaussians, inferred motion and its region (.svg or .png).
+    #[arg(long, value_name = "FILE", conflicts_with = "update")]
+    figure: Option<PathBuf>,
+    /// Print one JSON object instead, as `inspect --json` does.
+    #[arg(long)]
+    json: bool,
 }
 
 /// A frame that was less than this about its usual place shows nothing of what moves with it, root mean square, m.
@@ -52,6 +60,26 @@ pub(crate) struct InspectArgs {
     /// Show the motion with this frame placed anew, m in the recordings' axes; may be repeated.
     #[arg(long, value_name = "NAME=x,y,z[,qw,qx,qy,qz]")]
     frame: Vec<Placed>,
+    /// Draw it: Gaussians, inferred motion and its region (.svg or .png).
+    #[arg(long, value_name = "FILE")]
+    figure: Option<PathBuf>,
+    /// Draw the demonstrations too: the folder it was learned from.
+    #[arg(long, value_name = "DIR", requires = "figure")]
+    demos: Option<PathBuf>,
+    /// Draw this recording too, to compare with.
+    #[arg(long, value_name = "FILE", requires = "figure")]
+    truth: Option<PathBuf>,
+    /// Share of performances that the region drawn is to hold.
+    #[arg(long, value_name = "P", default_value_t = 0.95, value_parser = share)]
+    confidence: f64,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+fn share(text: &str) -> Result<f64, String> {
+    let share = text.parse::<f64>().ok().filter(|p| (0.0..1.0).contains(p));
+    share.ok_or_else(|| format!("`{text}` is not a share from 0 to below 1"))
 }
 
 pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
@@ -118,6 +146,22 @@ pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
         .clone()
         .unwrap_or_else(|| PathBuf::from(format!("{}.skill", skill.name())));
     skill_file::save(&skill, &path)?;
+    let motion = Motion::new(&skill, &[])?;
+    if let Some(figure) = &args.figure {
+        let subject = Subject {
+            skill: &skill,
+            motion: &motion,
+            demonstrations: &found.demonstrations,
+            truth: None,
+            confidence: 0.95,
+        };
+        picture::figure(&subject)?.write(figure)?;
+        eprintln!("drawn in {}", figure.display());
+    }
+    if args.json {
+        say!("{}", serde_json::to_string(&told(&skill, &motion))?);
+        return Ok(());
+    }
     describe(&skill);
     if found.demonstrations.len() > 1 {
         say!(
@@ -167,6 +211,11 @@ fn update(args: &LearnArgs, old: &Path) -> anyhow::Result<()> {
     }
     let path = args.output.as_deref().unwrap_or(old);
     skill_file::save(&skill, path)?;
+    if args.json {
+        let motion = Motion::new(&skill, &[])?;
+        say!("{}", serde_json::to_string(&told(&skill, &motion))?);
+        return Ok(());
+    }
     describe(&skill);
     say!(
         "refined by {}, saved to {}",
@@ -182,6 +231,31 @@ fn plural(n: usize, what: &str) -> String {
 
 pub(crate) fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
     let skill = skill_file::load(&args.file)?;
+    let motion = Motion::new(&skill, &args.frame)?;
+    if let Some(figure) = &args.figure {
+        let demonstrations = match &args.demos {
+            Some(dir) => picture::learned_from(&skill, dir)?,
+            None => Vec::new(),
+        };
+        let truth = args
+            .truth
+            .as_ref()
+            .map(Demonstration::read_csv)
+            .transpose()?;
+        let subject = Subject {
+            skill: &skill,
+            motion: &motion,
+            demonstrations: &demonstrations,
+            truth: truth.as_ref(),
+            confidence: args.confidence,
+        };
+        picture::figure(&subject)?.write(figure)?;
+        eprintln!("drawn in {}", figure.display());
+    }
+    if args.json {
+        say!("{}", serde_json::to_string(&told(&skill, &motion))?);
+        return Ok(());
+    }
     describe(&skill);
     for source in &skill.provenance().sources {
         let [a, b, c, d, ..] = source.sha256;
@@ -190,7 +264,6 @@ pub(crate) fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
             source.name
         );
     }
-    let motion = Motion::new(&skill, &args.frame)?;
     say!("inferred motion (t s, x y z m, deviation of each m):");
     for i in 0..=10 {
         let t_s = skill.duration_s() * f64::from(i) / 10.0;
@@ -209,6 +282,52 @@ pub(crate) fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// What `inspect --json` prints; `docs/commands.md` describes it.
+fn told(skill: &Skill, motion: &Motion) -> serde_json::Value {
+    let stats = skill.stats();
+    let sources = skill.provenance().sources.iter();
+    let hex = |bytes: &[u8]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
+    let motion: Vec<_> = (0..=100)
+        .map(|i| {
+            let t_s = skill.duration_s() * f64::from(i) / 100.0;
+            let at = motion.at(t_s);
+            let covariance: Vec<Vec<f64>> = at
+                .covariance
+                .row_iter()
+                .map(|row| row.iter().copied().collect())
+                .collect();
+            let q = motion.turn_at(t_s).map(|q| [q.w, q.i, q.j, q.k]);
+            serde_json::json!({
+                "t_s": t_s,
+                "x_m": at.mean.as_slice(),
+                "covariance_m2": covariance,
+                "q": q,
+            })
+        })
+        .collect();
+    let frames = skill.task().map_or(&[][..], |task| task.frames());
+    serde_json::json!({
+        "name": skill.name(),
+        "id": skill.id().to_string(),
+        "bytes": skill.to_bytes().len(),
+        "duration_s": skill.duration_s(),
+        "pace": skill.pace(),
+        "motion_components": skill.motion().components().len(),
+        "predictor_components": skill.predictor().components().len(),
+        "predictor_knots": skill.predictor().knots(),
+        "orientation": skill.turn().is_some(),
+        "gripper": skill.grip().is_some(),
+        "frames": frames.iter().map(|f| f.name.clone()).collect::<Vec<_>>(),
+        "stats": stats,
+        "producer": skill.provenance().producer,
+        "seed": skill.provenance().seed,
+        "sources": sources
+            .map(|s| serde_json::json!({"name": s.name, "sha256": hex(&s.sha256)}))
+            .collect::<Vec<_>>(),
+        "motion": motion,
+    })
+}
+
 fn describe(skill: &Skill) {
     let (stats, predictor) = (skill.stats(), skill.predictor());
     say!(
@@ -222,6 +341,19 @@ fn describe(skill: &Skill) {
         skill.duration_s(),
         skill.motion().components().len()
     );
+    if let Some(turn) = skill.turn() {
+        say!(
+            "  orientation: {} components over (t, rotation); predictor of {}",
+            turn.motion.charts().len(),
+            turn.predictor.charts().len()
+        );
+    }
+    if let Some(grip) = skill.grip() {
+        say!(
+            "  gripper: {} components over (t, opening)",
+            grip.components().len()
+        );
+    }
     for frame in skill.task().iter().flat_map(|task| task.frames()) {
         let (o, q) = (frame.usual.origin, frame.usual.turn);
         say!(

@@ -152,6 +152,11 @@ impl<'a> Motion<'a> {
         })
     }
 
+    /// Whether a frame was placed: the motion is then not that of the skill's own mixture.
+    pub fn is_moved(&self) -> bool {
+        self.task.is_some()
+    }
+
     /// Position (m) and its covariance (m²) at `t_s`.
     pub fn at(&self, t_s: f64) -> Regressed<3> {
         let plain = || self.plain.query(&SVector::from([t_s]));

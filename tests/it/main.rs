@@ -14,6 +14,7 @@ mod ingest;
 mod layout;
 mod mirror;
 mod paper;
+mod picture;
 mod play;
 mod prediction;
 mod processes;

@@ -1,5 +1,5 @@
 //! One time axis for all demonstrations: the medoid by dynamic time warping (Sakoe & Chiba 1978), and a warp
-//! to it that ascends at every step ([`warp`]).
+//! to it that ascends at every step (`warp`).
 
 use nalgebra::Vector3;
 

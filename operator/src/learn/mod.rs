@@ -13,7 +13,7 @@ pub mod select;
 mod stats;
 #[cfg(test)]
 mod tests;
-mod trial;
+pub(crate) mod trial;
 pub mod tube;
 pub mod turn;
 pub mod variational;
@@ -106,6 +106,18 @@ pub enum LearnError {
         path: PathBuf,
         /// What is missing.
         what: &'static str,
+    },
+    /// Some demonstrations of a skill show more than others.
+    #[error(
+        "{}: no {what}, which {other} has; give all recordings of a skill those columns, or none", path.display()
+    )]
+    Mixed {
+        /// The demonstration's file that shows less.
+        path: PathBuf,
+        /// What it lacks.
+        what: &'static str,
+        /// The name of one that has it.
+        other: String,
     },
     /// An object was seen in one place only.
     #[error(
@@ -219,6 +231,8 @@ pub fn learn_skill(
             limit: MAX_SOURCES,
         });
     }
+    let turns = all_or_none(demonstrations, ORIENTATION, Demonstration::has_orientation)?;
+    let grips = all_or_none(demonstrations, GRIP, Demonstration::has_grip)?;
     let aligned = align::align(demonstrations)?;
     let tubes = tube::BeforeAfter::of(demonstrations, &aligned);
     progress(Progress::Aligned {
@@ -244,7 +258,7 @@ pub fn learn_skill(
         options.seed,
         &mut progress,
     )?;
-    let turn = if demonstrations.iter().all(Demonstration::has_orientation) {
+    let turn = if turns {
         Some(Turn {
             motion: turn::fit(&aligned, demonstrations)?,
             predictor: predictor::train_turns(
@@ -257,7 +271,7 @@ pub fn learn_skill(
     } else {
         None
     };
-    let grip = if demonstrations.iter().all(Demonstration::has_grip) {
+    let grip = if grips {
         Some(grip::fit(&aligned, demonstrations, options.seed)?)
     } else {
         None
@@ -275,6 +289,28 @@ pub fn learn_skill(
         samples: samples(&aligned, demonstrations),
         provenance: provenance(demonstrations, options.seed),
     })?)
+}
+
+/// Columns that not every recording has, for people.
+const ORIENTATION: &str = "orientation (qw,qx,qy,qz)";
+const GRIP: &str = "grip";
+
+/// Whether the demonstrations have something.
+fn all_or_none(
+    demonstrations: &[Demonstration],
+    what: &'static str,
+    has: impl Fn(&Demonstration) -> bool,
+) -> Result<bool, LearnError> {
+    let with = demonstrations.iter().find(|d| has(d));
+    let without = demonstrations.iter().find(|d| !has(d));
+    match (with, without) {
+        (Some(with), Some(without)) => Err(LearnError::Mixed {
+            path: without.path().to_owned(),
+            what,
+            other: with.name().to_owned(),
+        }),
+        (with, _) => Ok(with.is_some()),
+    }
 }
 
 /// Durations vary by 5 % at least: a handful of performances cannot show less.

@@ -10,7 +10,7 @@ use telemime_protocol::skill::{
 use super::align::{POINTS, warp_to};
 use super::em::{self, Convergence, EmOptions};
 use super::predictor::{Places, Turns, refine as refine_predictor};
-use super::{LEAST_DEVIATION_LN, LearnError, frames, short, statistics, turn};
+use super::{GRIP, LEAST_DEVIATION_LN, LearnError, ORIENTATION, frames, short, statistics, turn};
 use crate::demonstration::Demonstration;
 
 /// A demonstration of which more than this share is new to the skill is probably not one of it.
@@ -38,7 +38,7 @@ impl Refinement {
 /// Refines `skill` with one demonstration more.
 ///
 /// It is warped onto the skill's own regression, and each mixture over time goes on with EM, its components
-/// standing for the rows they explained ([`em::update`]). The predictor's regressions give back the scatters they were
+/// standing for the rows they explained ([`em::update()`]). The predictor's regressions give back the scatters they were
 /// made of. The number of components stays, and so does the seed; a demonstration weighs as much as each before.
 ///
 /// # Errors
@@ -63,10 +63,10 @@ pub fn refine(skill: &Skill, d: &Demonstration) -> Result<(Skill, Refinement), L
         what,
     };
     if old.turn.is_some() && !d.has_orientation() {
-        return Err(lacks("orientation (qw,qx,qy,qz)"));
+        return Err(lacks(ORIENTATION));
     }
     if old.grip.is_some() && !d.has_grip() {
-        return Err(lacks("grip"));
+        return Err(lacks(GRIP));
     }
     let mut ignored = Vec::new();
     if old.turn.is_none() && d.has_orientation() {

@@ -11,7 +11,7 @@ use super::stats::quantile;
 use crate::demonstration::Demonstration;
 
 /// 90 % quantile of χ² with three degrees of freedom.
-const CHI2_3_90: f64 = 6.251;
+pub(crate) const CHI2_3_90: f64 = 6.251;
 
 /// Variances and novelties below these are a sensor at rest, not precision: m², and none.
 const LEAST_M2: f64 = 1e-8;

@@ -8,8 +8,8 @@ use telemime_protocol::skill::{Gmm, TurnMixture};
 
 use super::LearnError;
 use super::align::Aligned;
-use super::em::add_outer;
-use super::em::mirror;
+use super::em::{add_outer, mirror};
+use super::motion::normal_log_density;
 use super::select::bic_of_means;
 use crate::demonstration::Demonstration;
 
@@ -70,7 +70,9 @@ pub fn fit(aligned: &Aligned, demonstrations: &[Demonstration]) -> Result<TurnMi
             continue;
         };
         let components = mixture.charts().len();
-        let score = regression_score(&mixture, &rows);
+        let Some(score) = regression_score(&mixture, &rows) else {
+            continue;
+        };
         let bic = bic_of_means(components, 4, score, rows.len());
         if best.as_ref().is_none_or(|(least, _)| bic < *least) {
             best = Some((bic, mixture));
@@ -204,21 +206,14 @@ fn maximise(rows: &[Row], shares: &[f64], k: usize, ridge: &Vector4<f64>) -> Opt
     TurnMixture::new(gmm, charts).ok()
 }
 
-/// Mean log density (nats a row) of the orientations under the regression over time.
-fn regression_score(mixture: &TurnMixture, rows: &[Row]) -> f64 {
+/// Mean log density (nats a row) of the orientations under the regression over time; `None` if that is singular.
+fn regression_score(mixture: &TurnMixture, rows: &[Row]) -> Option<f64> {
     let mut sum = 0.0;
     for (t_s, q) in rows {
         let at = mixture.query(*t_s);
-        let covariance = at.covariance + Matrix3::identity() * f64::MIN_POSITIVE;
-        let Some(factor) = covariance.cholesky() else {
-            return f64::NEG_INFINITY;
-        };
-        let error = pose::between(&at.mean, q);
-        let log_det: f64 = (0..3).map(|d| factor.l_dirty()[(d, d)].ln()).sum();
-        let distance2 = error.dot(&factor.solve(&error));
-        sum -= 0.5 * distance2 + log_det + 1.5 * std::f64::consts::TAU.ln();
+        sum += normal_log_density(&pose::between(&at.mean, q), &at.covariance)?;
     }
-    sum / rows.len() as f64
+    Some(sum / rows.len() as f64)
 }
 
 #[cfg(test)]

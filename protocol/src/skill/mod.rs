@@ -215,7 +215,7 @@ pub struct Parts {
 }
 
 /// A learned skill. It exists only in the form its encoding gives it: a predictor's numbers are
-/// rounded to `f32` on construction, so that whoever learned it runs what everybody else runs.
+/// rounded on construction as they travel, so that whoever learned it runs what everybody else runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Skill {
     parts: Parts,

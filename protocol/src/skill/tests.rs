@@ -1,9 +1,11 @@
-use nalgebra::{SMatrix, SVector};
+use nalgebra::{SMatrix, SVector, UnitQuaternion};
 use proptest::prelude::*;
 
 use super::example::{example, example_model, posed_example};
 use super::*;
-use crate::predict::{Calibration, HandState, Regression, Standardisation};
+use crate::predict::{
+    Calibration, HandState, Params, Regression, Standardisation, TurnState, checksum,
+};
 use crate::time::Stamp;
 
 #[test]
@@ -214,6 +216,43 @@ proptest! {
             prop_assert_eq!(skill.to_bytes(), &bytes[..]);
         }
         prop_assert!(Skill::from_bytes(&bytes[..cut % n]).is_err());
+    }
+}
+
+proptest! {
+    /// Whatever a damaged skill still says, both ends can run it.
+    #[test]
+    fn a_damaged_posed_skill_is_refused_or_runs(
+        damage in prop::collection::vec((0_usize..65_536, any::<u8>()), 1..4),
+    ) {
+        let mut bytes = posed_example(3, 4).to_bytes().to_vec();
+        let n = bytes.len();
+        for (at, value) in damage {
+            bytes[at % n] = value;
+        }
+        let Ok(skill) = Skill::from_bytes(&bytes) else {
+            return Ok(());
+        };
+        prop_assert_eq!(skill.to_bytes(), &bytes[..]);
+        let mut state = HandState::first(Stamp(0), Vector3::new(0.1, 0.2, 2.0));
+        state.advance(Stamp(40_000_000), Vector3::new(0.2, 0.2, 1.9));
+        let place = skill.predictor().forecast(&state, &Params::DEFAULT);
+        prop_assert!(place.at(0.1).position.iter().all(|v| v.is_finite()));
+        let turn = skill.turn().map(|turn| {
+            let mut state = TurnState::first(Stamp(0), UnitQuaternion::identity());
+            state.advance(Stamp(40_000_000), UnitQuaternion::from_euler_angles(0.1, 0.2, 0.3));
+            turn.motion.query(0.3);
+            turn.predictor.forecast(&state, &Params::DEFAULT)
+        });
+        if let Some(turn) = &turn {
+            prop_assert!(turn.at(0.1).orientation.coords.iter().all(|v| v.is_finite()));
+        }
+        checksum(&place, turn.as_ref());
+        if let Some(task) = skill.task() {
+            let usual: Vec<_> = task.frames().iter().map(|f| f.usual).collect();
+            task.at(0.5, &usual).unwrap();
+            task.turned_at(0.5, &usual).unwrap();
+        }
     }
 }
 
