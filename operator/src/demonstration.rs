@@ -2,27 +2,8 @@
 //! Comment lines may place objects: `# frame NAME x y z [qw qx qy qz]`.
 
 mod error;
+mod folder;
 pub(crate) mod frames;
-
-/// Whether `name` matches `pattern`, in which `*` stands for any text. Each piece between stars is taken where
-/// it first occurs, which never rules a later one out.
-fn matches(pattern: &str, name: &str) -> bool {
-    let Some((head, rest)) = pattern.split_once('*') else {
-        return pattern == name;
-    };
-    let Some(mut name) = name.strip_prefix(head) else {
-        return false;
-    };
-    let (middle, tail) = rest.rsplit_once('*').unwrap_or(("", rest));
-    for piece in middle.split('*') {
-        let Some(at) = name.find(piece) else {
-            return false;
-        };
-        name = &name[at + piece.len()..];
-    }
-    name.ends_with(tail)
-}
-
 #[cfg(test)]
 mod tests;
 
@@ -36,12 +17,19 @@ use telemime_protocol::pose;
 use telemime_protocol::skill::Placement;
 
 pub use error::{DemonstrationError, Notice};
+pub use folder::Demonstrations;
 
 /// A demonstration needs at least this many samples.
 pub const LEAST_SAMPLES: usize = 8;
 
 /// The largest coordinate (m) and time (s) a recording may hold: beyond it the unit is wrong.
 const LARGEST: f64 = 1e6;
+
+/// A longer time without a sample (s) hides motion, or is stated in another unit.
+const LONGEST_GAP_S: f64 = 2.0;
+
+/// A hand moves through less than this; more, and the unit of length is wrong, m.
+pub(crate) const LARGEST_EXTENT_M: f64 = 10.0;
 
 /// The hand at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -177,6 +165,10 @@ impl Demonstration {
                     path,
                 });
             }
+            let gap_s = samples.last().map_or(0.0, |last| t_s - last.t_s);
+            if gap_s > LONGEST_GAP_S {
+                return Err(DemonstrationError::Gap { path, line, gap_s });
+            }
             let orientation = match &turn {
                 None => None,
                 Some(at) => {
@@ -220,6 +212,10 @@ impl Demonstration {
                 path,
                 found: samples.len(),
             });
+        }
+        let extent_m = extent_m(&samples);
+        if extent_m > LARGEST_EXTENT_M {
+            return Err(DemonstrationError::Extent { path, extent_m });
         }
         let ignored: Vec<String> = columns
             .iter()
@@ -351,86 +347,15 @@ impl Demonstration {
     }
 }
 
-/// The demonstrations of one skill.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Demonstrations {
-    /// The skill's name: that of the folder.
-    pub name: String,
-    /// At least one, by file name.
-    pub demonstrations: Vec<Demonstration>,
-    /// What a reader should know about the files.
-    pub notices: Vec<Notice>,
-}
-
-impl Demonstrations {
-    /// Reads every `*.csv` of a folder, by name; with a `pattern`, those whose name without the ending
-    /// matches it (`*` stands for anything).
-    ///
-    /// # Errors
-    /// [`DemonstrationError`]: of any of the files, or of the folder.
-    pub fn read_dir(
-        dir: impl AsRef<Path>,
-        pattern: Option<&str>,
-    ) -> Result<Self, DemonstrationError> {
-        let dir = dir.as_ref();
-        let io = |source| DemonstrationError::Io {
-            path: dir.to_owned(),
-            source,
-        };
-        let name = dir
-            .canonicalize()
-            .map_err(io)?
-            .file_name()
-            .and_then(|n| n.to_str())
-            .filter(|n| (1..=64).contains(&n.len()))
-            .ok_or_else(|| DemonstrationError::FolderName {
-                path: dir.to_owned(),
-            })?
-            .to_owned();
-        let mut paths = Vec::new();
-        for entry in fs::read_dir(dir).map_err(io)? {
-            let path = entry.map_err(io)?.path();
-            if path
-                .extension()
-                .is_some_and(|e| e.eq_ignore_ascii_case("csv"))
-            {
-                paths.push(path);
-            }
-        }
-        paths.sort();
-        if let Some(pattern) = pattern {
-            let name = |p: &PathBuf| {
-                p.file_stem()
-                    .is_some_and(|n| matches(pattern, &n.to_string_lossy()))
-            };
-            paths.retain(name);
-        }
-        let demonstrations = paths
-            .iter()
-            .map(Demonstration::read_csv)
-            .collect::<Result<Vec<_>, _>>()?;
-        let Some(first) = demonstrations.first() else {
-            return Err(DemonstrationError::NoDemonstrations {
-                path: dir.to_owned(),
-            });
-        };
-        if let Some(other) = demonstrations.iter().find(|d| d.columns != first.columns) {
-            return Err(DemonstrationError::Shape {
-                path: other.path.clone(),
-                found: other.columns.join(","),
-                first: first.path.clone(),
-                expected: first.columns.join(","),
-            });
-        }
-        Ok(Self {
-            name,
-            notices: demonstrations
-                .iter()
-                .flat_map(|d| d.notices.iter().cloned())
-                .collect(),
-            demonstrations,
-        })
+/// The range of the most moved coordinate, m.
+fn extent_m(samples: &[Sample]) -> f64 {
+    let mut low = Vector3::repeat(f64::INFINITY);
+    let mut high = -low;
+    for s in samples {
+        low = low.inf(&s.position);
+        high = high.sup(&s.position);
     }
+    (high - low).max()
 }
 
 fn usable(value: f64) -> bool {

@@ -10,7 +10,7 @@ use telemime_protocol::skill::{FileError, Skill};
 #[derive(Debug, thiserror::Error)]
 pub enum SkillFileError {
     /// The file system refused.
-    #[error("{}: {source}; check that the folder exists and may be used", path.display())]
+    #[error("{}: {source}; check that it exists and may be used", path.display())]
     Io {
         /// The file.
         path: PathBuf,
@@ -18,13 +18,24 @@ pub enum SkillFileError {
         source: io::Error,
     },
     /// The file is not a usable skill.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {source}{}", path.display(), remedy(source))]
     Content {
         /// The file.
         path: PathBuf,
         /// What is wrong with it.
         source: FileError,
     },
+}
+
+/// What to do about it, where the fault does not say.
+fn remedy(fault: &FileError) -> &'static str {
+    match fault {
+        FileError::NotASkill => "; `telemime learn` makes one",
+        FileError::Length { .. } | FileError::Checksum => {
+            "; copy it again, or learn the skill again"
+        }
+        _ => "",
+    }
 }
 
 /// Reads a skill file.
@@ -99,7 +110,16 @@ mod tests {
         fs::write(&path, "t,x,y,z\n").unwrap();
         let message = load(&path).unwrap_err().to_string();
         assert!(
-            message.ends_with("line.skill: not a Telemime skill file"),
+            message.ends_with("line.skill: not a Telemime skill file; `telemime learn` makes one"),
+            "{message}"
+        );
+        let mut bytes = skill.to_file();
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+        fs::write(&path, &bytes).unwrap();
+        let message = load(&path).unwrap_err().to_string();
+        assert!(
+            message.ends_with("; copy it again, or learn the skill again"),
             "{message}"
         );
         assert!(save(&skill, dir.path().join("no/such/folder")).is_err());

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use serde_json::json;
+use telemime_endpoint::cli::one_line;
 use telemime_operator::ingest::segment::Method;
 use telemime_operator::ingest::{
     Axes, Columns, Cut, Format, Imported, IngestError, LengthUnit, MAX_GAP_S, Options, Report,
@@ -155,7 +156,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             tell(&one);
         }
         if let Err(e) = &one.result {
-            eprintln!("telemime: {e:#}");
+            eprintln!("telemime: {}", one_line(e.chain()));
         }
         done.push(one);
     }
@@ -286,7 +287,7 @@ fn summary(done: &[Done]) -> serde_json::Value {
                 json!({"raw": d.raw, "written": paths, "error": null, "report": imported.report})
             }
             Err(e) => {
-                json!({"raw": d.raw, "written": [], "error": format!("{e:#}"), "report": null})
+                json!({"raw": d.raw, "written": [], "error": one_line(e.chain()), "report": null})
             }
         })
         .collect();

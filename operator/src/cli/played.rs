@@ -19,6 +19,8 @@ pub(super) struct Played {
     tip: Vec<(f64, Vector3<f64>)>,
     /// The same for its orientation, where that is followed.
     turn: Vec<(f64, UnitQuaternion<f64>)>,
+    /// Ticks on which a limit held the arm back.
+    clamps: u32,
 }
 
 struct Engaged {
@@ -44,6 +46,7 @@ impl Played {
             engaged: None,
             tip: Vec::new(),
             turn: Vec::new(),
+            clamps: 0,
         }
     }
 
@@ -86,6 +89,7 @@ impl Played {
             let tip_m = Vector3::from(telemetry.tip_m).cast::<f64>();
             let moved = self.rotation.inverse() * (tip_m - engaged.tip_m) / self.scale;
             self.tip.push((t_s, engaged.hand_m + moved));
+            self.clamps = telemetry.clamps;
             if let Some(hand_q) = engaged.hand_q {
                 let turned = telemetry.tip_q.dequantise() * engaged.tip_q.inverse();
                 let turned = self.rotation.inverse() * turned * self.rotation;
@@ -111,6 +115,7 @@ impl Played {
         });
         Some(Event::Played {
             samples: sent.len(),
+            clamps: self.clamps,
             rebuilt_to_tip: Scores::of(&sent, &followed),
             demonstrations_to_tip: demonstrations,
             turn_to_tip: (!self.turn.is_empty()).then(|| {
@@ -184,7 +189,7 @@ mod tests {
                 received: 0,
                 newest_seq: 0,
                 dropped: 0,
-                clamps: 0,
+                clamps: i as u32 * 7,
                 tick_mean_ns: 0,
                 tick_p99_ns: 0,
                 overruns: 0,
@@ -195,18 +200,37 @@ mod tests {
             };
             played.hear(&session::Event::Telemetry(Box::new(telemetry)));
         }
-        let Some(Event::Played {
+        let event = played.scores().unwrap();
+        let Event::Played {
             samples,
+            clamps,
             rebuilt_to_tip,
             ..
-        }) = played.scores()
+        } = &event
         else {
             panic!("no scores")
         };
-        assert_eq!(samples, 21);
+        assert_eq!((*samples, *clamps), (21, 140));
+        // Limits that did not matter are no news.
+        assert!(!event.text().unwrap().contains("140 ticks"));
         assert!(
             rebuilt_to_tip.r2 > 0.999_999 && rebuilt_to_tip.max_m < 1e-5,
             "{rebuilt_to_tip:?}"
+        );
+        let missed = Event::Played {
+            samples: 21,
+            clamps: 140,
+            rebuilt_to_tip: Scores {
+                r2: -2.0,
+                ..*rebuilt_to_tip
+            },
+            demonstrations_to_tip: None,
+            turn_to_tip: None,
+        };
+        let text = missed.text().unwrap();
+        assert!(
+            text.contains("limits held the arm back on 140 ticks"),
+            "{text}"
         );
     }
 }

@@ -15,6 +15,9 @@ use crate::recognise::Verdict;
 use crate::session;
 use crate::task::{Outcome, Task};
 
+/// A motion that explains less of the tip's was not followed.
+const FOLLOWED_R2: f64 = 0.9;
+
 /// How well one series follows another: mean absolute and squared error, and R² of the worst axis.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Scores {
@@ -198,6 +201,7 @@ pub enum Event {
     },
     Played {
         samples: usize,
+        clamps: u32,
         rebuilt_to_tip: Scores,
         demonstrations_to_tip: Option<Scores>,
         turn_to_tip: Option<TurnScores>,
@@ -244,7 +248,7 @@ impl Event {
         }
     }
 
-    fn text(&self) -> Option<String> {
+    pub(super) fn text(&self) -> Option<String> {
         Some(match self {
             Self::Fingerprint { fingerprint } => format!("fingerprint {fingerprint}"),
             Self::Note { text } => format!("note: {text}"),
@@ -315,6 +319,7 @@ impl Event {
             Self::Progress { .. } | Self::Telemetry { .. } => return None,
             Self::Played {
                 samples,
+                clamps,
                 rebuilt_to_tip,
                 demonstrations_to_tip,
                 turn_to_tip,
@@ -342,6 +347,12 @@ impl Event {
                         "; orientation {:.2}° RMS, {:.2}° at most",
                         turn.rms_rad.to_degrees(),
                         turn.max_rad.to_degrees()
+                    ));
+                }
+                if *clamps > 0 && rebuilt_to_tip.r2 < FOLLOWED_R2 {
+                    text.push_str(&format!(
+                        "\nlimits held the arm back on {clamps} ticks: a motion begins wherever the arm is, and from here it \
+                         leads out of reach; start the robot again, which takes it to its start posture, or lower --scale"
                     ));
                 }
                 text

@@ -207,9 +207,11 @@ fn learn(
 ) -> anyhow::Result<Skill> {
     let skill = learn_skill(name, demonstrations, options, |progress| {
         if let Progress::Motion { degenerate, .. } = &progress {
-            degenerate
-                .iter()
-                .for_each(|d| log.note(&format!("{name}: {d:?}")));
+            degenerate.iter().for_each(|d| {
+                log.note(&format!(
+                    "{name}: the motion's mixture over (t, x, y, z): {d}"
+                ))
+            });
         }
     })
     .with_context(|| format!("cannot learn {name}"))?;

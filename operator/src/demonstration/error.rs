@@ -4,7 +4,7 @@ use std::fmt;
 use std::io;
 use std::path::PathBuf;
 
-use super::LEAST_SAMPLES;
+use super::{LARGEST_EXTENT_M, LEAST_SAMPLES};
 
 /// Why a recording cannot be learned from. Every message names the file, the line and the remedy.
 #[derive(Debug, thiserror::Error)]
@@ -21,6 +21,22 @@ pub enum DemonstrationError {
     #[error("{}: no *.csv in this folder; a skill is a folder with one CSV for each demonstration", path.display())]
     NoDemonstrations {
         /// The folder.
+        path: PathBuf,
+    },
+    /// No `*.csv` of the folder matches the pattern.
+    #[error("{}: none of the {all} *.csv matches {pattern:?}; it is held against the names without .csv, and * stands for anything", path.display())]
+    NoMatch {
+        /// The folder.
+        path: PathBuf,
+        /// The pattern.
+        pattern: String,
+        /// How many `*.csv` there are.
+        all: usize,
+    },
+    /// A file where a folder is needed.
+    #[error("{}: a file; a skill is a folder with one CSV for each demonstration: give that", path.display())]
+    NoFolder {
+        /// The file.
         path: PathBuf,
     },
     /// The folder's name cannot name a skill.
@@ -123,6 +139,24 @@ pub enum DemonstrationError {
         /// The time on the line before, s.
         previous_s: f64,
     },
+    /// So long without a sample that what the hand did meanwhile is not known.
+    #[error("{}, line {line}: {gap_s:.3} s after the sample before; `telemime import` splits a recording at its holes, and converts times that are not in s", path.display())]
+    Gap {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: u64,
+        /// Time since the line before, s.
+        gap_s: f64,
+    },
+    /// The hand cannot have moved so far.
+    #[error("{}: the hand moves through {extent_m:.1} m, more than {LARGEST_EXTENT_M} m; positions are in m: `telemime import --unit mm` converts others", path.display())]
+    Extent {
+        /// The file.
+        path: PathBuf,
+        /// The range of the most moved coordinate, m.
+        extent_m: f64,
+    },
     /// Fewer than [`LEAST_SAMPLES`].
     #[error("{}: {found} samples, at least {LEAST_SAMPLES} are needed; record it again or remove the file", path.display())]
     TooShort {
@@ -155,6 +189,13 @@ pub enum Notice {
         /// Their names.
         columns: Vec<String>,
     },
+    /// The same recording under another name: it counts twice.
+    Copy {
+        /// The file.
+        path: PathBuf,
+        /// The one it is a copy of.
+        first: PathBuf,
+    },
 }
 
 impl fmt::Display for Notice {
@@ -168,6 +209,12 @@ impl fmt::Display for Notice {
                     columns.join(", ")
                 )
             }
+            Self::Copy { path, first } => write!(
+                f,
+                "{}: the same recording as {}, and counts twice; remove one",
+                path.display(),
+                first.display()
+            ),
         }
     }
 }

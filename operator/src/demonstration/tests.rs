@@ -50,6 +50,14 @@ fn every_fault_names_file_line_and_remedy() {
             "skill/take.csv, line 5: t = 0.1 s is not after",
         ),
         (
+            with(11, "40.9,1,2,3"),
+            "skill/take.csv, line 11: 40.100 s after the sample before; `telemime import` splits",
+        ),
+        (
+            with(11, "0.9,1,12.5,3"),
+            "skill/take.csv: the hand moves through 10.5 m, more than 10 m; positions are in m: `telemime import",
+        ),
+        (
             with(6, "0.4,1,2"),
             "skill/take.csv, line 6: 3 fields where the header has 4",
         ),
@@ -113,6 +121,21 @@ fn a_folder_is_a_skill() {
         skill.demonstrations[1].sha256()
     );
 
+    assert_eq!(skill.notices.len(), 1);
+    let notice = skill.notices[0].to_string();
+    assert!(notice.contains("b.csv: the same recording as"), "{notice}");
+    let message = |path: &Path, pattern| {
+        let e = Demonstrations::read_dir(path, pattern).unwrap_err();
+        e.to_string()
+    };
+    let none = message(&dir, Some("wave_*"));
+    assert!(
+        none.contains("none of the 2 *.csv matches \"wave_*\""),
+        "{none}"
+    );
+    let file = message(&dir.join("a.csv"), None);
+    assert!(file.contains("a file; a skill is a folder"), "{file}");
+
     let wider = good("t,x,y,z,grip", |i| format!("{i},1,2,3,1")).join("\n");
     fs::write(dir.join("c.csv"), wider).unwrap();
     assert!(matches!(
@@ -156,7 +179,7 @@ proptest::proptest! {
 
 #[test]
 fn a_pattern_picks_files_by_name() {
-    let matching = |pattern: &str, name: &str| super::matches(pattern, name);
+    let matching = |pattern: &str, name: &str| super::folder::matches(pattern, name);
     assert!(matching("a3_s2_*", "a3_s2_t1") && !matching("a3_s2_*", "a3_s21_t1"));
     assert!(matching("*", "") && matching("*t1", "a3_s2_t1") && matching("a*s2*", "a3_s2_t1"));
     assert!(!matching("a", "ab") && !matching("*x*", "abc"));

@@ -32,7 +32,7 @@ pub use error::{Fault, IngestError};
 pub use report::{Cuts, Report, TakeReport};
 pub use units::{Axes, Format, LengthUnit, TimeUnit};
 
-use crate::demonstration::LEAST_SAMPLES;
+use crate::demonstration::{LARGEST_EXTENT_M, LEAST_SAMPLES};
 use order::Scale;
 use read::{Raw, Raws};
 
@@ -41,9 +41,6 @@ pub const FPS: f64 = 30.0;
 
 /// A hole longer than this splits a recording, s, unless said otherwise.
 pub const MAX_GAP_S: f64 = 0.5;
-
-/// A hand moves through less than this; more, and the unit of length is wrong, m.
-const LARGEST_EXTENT_M: f64 = 10.0;
 
 /// The hand at one moment.
 #[derive(Debug, Clone, PartialEq)]

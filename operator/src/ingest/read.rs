@@ -46,8 +46,10 @@ pub(super) fn read(
     let Some(first) = first else {
         return Err(Fault::Empty);
     };
+    let headed = rows.first().is_some_and(|r| r.line != first.line);
     let format = format.unwrap_or(match first.fields.len() {
-        3 if columns.is_empty() => Format::Kard,
+        // A skeleton of joints has no header: three names are those of a table's columns.
+        3 if columns.is_empty() && !headed => Format::Kard,
         KINECT_FIELDS => Format::Kinect,
         _ => Format::Csv,
     });

@@ -370,3 +370,13 @@ fn any_bytes_end_in_a_result() {
         }
     });
 }
+
+#[test]
+fn three_named_columns_are_a_table_and_no_skeleton() {
+    let rows: String = (0..45).map(|i| format!("{i},1,2\n")).collect();
+    // As many lines as three frames of 15 joints have.
+    let told = plain(&format!("t,x,y\n{rows}")).unwrap_err().to_string();
+    assert!(told.contains("no column \"z\""), "{told}");
+    let told = plain(&format!("x,y,z\n{rows}")).unwrap_err();
+    assert!(matches!(told, Fault::NoTime), "{told}");
+}

@@ -4,7 +4,7 @@ use nalgebra::{SMatrix, SVector, Vector3, Vector4};
 use telemime_protocol::skill::{Gmm, Gmr};
 
 use super::align::Aligned;
-use super::em::{self, EmOptions, Fit};
+use super::em::{self, Degenerate, EmOptions, Fit};
 use super::select::{Candidate, bic_of_means};
 use super::{LearnError, LearnOptions, Progress};
 
@@ -43,6 +43,7 @@ pub fn rows(aligned: &Aligned) -> Vec<Vec<Vector4<f64>>> {
 /// position at each time. By the joint likelihood a motion to and fro is best told as places the hand
 /// keeps returning to, and its regression over time is one long average. For the same reason both starts
 /// (time bins, k-means++) compete by this criterion, and covariances are not counted ([`bic_of_means`]).
+/// A mixture that learned samples by heart is taken only where there is no other.
 ///
 /// # Errors
 /// [`LearnError`], as of the fit.
@@ -52,7 +53,7 @@ pub fn fit(
     progress: &mut impl FnMut(Progress),
 ) -> Result<Gmm<4>, LearnError> {
     let rows = rows(aligned).concat();
-    let mut best: Result<(f64, Fit<4>), LearnError> = Err(LearnError::Components { asked: 0 });
+    let mut best: Result<(Rank, Fit<4>), LearnError> = Err(LearnError::Components { asked: 0 });
     for components in LADDER
         .into_iter()
         .filter(|k| options.motion_components.contains(k))
@@ -78,8 +79,9 @@ pub fn fit(
                         bic,
                         score,
                     }));
-                    if best.as_ref().map_or(true, |(least, _)| bic < *least) {
-                        best = Ok((bic, fit));
+                    let rank = (memorises(&fit), bic);
+                    if best.as_ref().map_or(true, |(least, _)| rank < *least) {
+                        best = Ok((rank, fit));
                     }
                 }
                 Err(e) => best = best.or(Err(e)),
@@ -93,6 +95,23 @@ pub fn fit(
         degenerate: best.degenerate,
     });
     Ok(best.gmm)
+}
+
+/// Whether the mixture learned samples by heart, and its criterion: the smallest is best.
+type Rank = (bool, f64);
+
+/// Whether more than a quarter of the components stand for fewer samples than span a covariance, or for a single moment.
+/// Such a mixture explains every row and jumps from one to the next: the criterion, which looks at the rows alone, would
+/// have nothing against it.
+fn memorises(fit: &Fit<4>) -> bool {
+    let of_few = |d: &&Degenerate| matches!(d, Degenerate::Shrunk { .. });
+    let few = fit.degenerate.iter().filter(of_few).count();
+    let of_a_moment = |d: &Degenerate| match *d {
+        Degenerate::Floored { axis, components } if axis == 0 => components,
+        _ => 0,
+    };
+    let moments: usize = fit.degenerate.iter().map(of_a_moment).sum();
+    4 * few.max(moments) > fit.gmm.components().len()
 }
 
 /// Mean log density (nats a row) of all coordinates but the first under their regression over it.

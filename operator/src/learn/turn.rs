@@ -270,7 +270,7 @@ mod tests {
         let samples: Vec<_> = (0..40)
             .map(|i| Sample {
                 orientation: Some(pose::exp(&Vector3::x())),
-                ..Sample::at(f64::from(i) * 0.03, Vector3::x() * f64::from(i))
+                ..Sample::at(f64::from(i) * 0.03, Vector3::x() * 0.1 * f64::from(i))
             })
             .collect();
         let still = [Demonstration::from_samples("still", &samples).unwrap()];
@@ -281,7 +281,7 @@ mod tests {
     #[test]
     fn nothing_to_learn_from_is_said() {
         let samples: Vec<_> = (0..40)
-            .map(|i| Sample::at(f64::from(i) * 0.03, Vector3::x() * f64::from(i)))
+            .map(|i| Sample::at(f64::from(i) * 0.03, Vector3::x() * 0.1 * f64::from(i)))
             .collect();
         let bare = [Demonstration::from_samples("bare", &samples).unwrap()];
         let refused = fit(&align(&bare).unwrap(), &bare);

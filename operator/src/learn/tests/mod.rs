@@ -1,3 +1,4 @@
+mod few;
 mod mixtures;
 
 use std::cell::Cell;
