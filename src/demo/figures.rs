@@ -104,6 +104,7 @@ pub(super) fn tube_panel(material: &Material, skill: &Skill, d: usize) -> anyhow
         x_label: "time / s".into(),
         y_label: axis_label(d),
         equal_axes: false,
+        doubling: false,
         layers,
     })
 }
@@ -139,6 +140,7 @@ fn path_panel(run: &Run, verdict: &Verdict, (a, b): (usize, usize)) -> Panel {
         x_label: axis_label(a),
         y_label: axis_label(b),
         equal_axes: true,
+        doubling: false,
         layers: vec![
             Layer::new(
                 format!("± {:.0} mm promised", bound_m * 1e3),
@@ -167,6 +169,7 @@ pub(super) fn mirror(
         x_label: "time / s".into(),
         y_label: axis_label(d),
         equal_axes: false,
+        doubling: false,
         layers: vec![
             Layer::new(
                 "delayed",
@@ -197,6 +200,7 @@ pub(super) fn mirror(
         x_label: "time / s".into(),
         y_label: "distance / m".into(),
         equal_axes: false,
+        doubling: false,
         layers: vec![
             Layer::new(
                 "delayed",
