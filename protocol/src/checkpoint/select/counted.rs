@@ -3,6 +3,7 @@
 use nalgebra::SVector;
 
 use super::super::{CheckpointError, Grid, MAX_POINTS, Plan, check_series};
+use super::super::plan::MAX_STEPS;
 use super::search::{Motion, Search};
 
 /// Sample evaluations spent on moving points.
@@ -50,7 +51,10 @@ pub fn counted<const D: usize>(
         return Err(CheckpointError::Unordered { index: 1 });
     }
     let rms_m = (sum / (t.len() * D) as f64).sqrt();
-    let grid = Grid::for_bound((4.0 * STEP * rms_m).clamp(4e-9, 4.0))?;
+    let largest = y.iter().map(|y| y.amax()).fold(0.0, f64::max);
+    // Not so fine that the values do not fit, twice over for those off the curve.
+    let step_m = (STEP * rms_m).max(largest * 2.0 / f64::from(MAX_STEPS));
+    let grid = Grid::for_bound((4.0 * step_m).clamp(4e-9, 16.0))?;
     search.squares(&kept);
     search.plan_on(&kept, Grid::new(grid.step_nm(), any.tick_us())?)
 }
