@@ -59,7 +59,11 @@ fn live_decoding(bencher: Bencher) {
     let knots: Vec<_> = t
         .iter()
         .zip(&x)
-        .filter_map(|(t, x)| encoder.push(Stamp::from_secs_f64(*t), *x).expect("a sample"))
+        .filter_map(|(t, x)| {
+            encoder
+                .push(Stamp::from_secs_f64(*t), *x)
+                .expect("a sample")
+        })
         .collect();
     let grid = encoder.grid();
     bencher
