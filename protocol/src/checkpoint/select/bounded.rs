@@ -154,6 +154,9 @@ fn refine<const D: usize>(
     while kept.len() > 2 && search.effort < REFINING_EFFORT {
         let mut costs: Vec<(f64, usize)> = Vec::new();
         for j in 1..kept.len() - 1 {
+            if search.effort >= REFINING_EFFORT {
+                return Ok(());
+            }
             let mut without = kept.clone();
             without.remove(j);
             costs.push((search.fit(&without, bound, 4.0 * bound), j));
@@ -195,6 +198,9 @@ fn relocate<const D: usize>(
     while moved && search.effort < REFINING_EFFORT {
         moved = false;
         for &j in &order {
+            if search.effort >= REFINING_EFFORT {
+                return false;
+            }
             for step in [-4, -2, -1, 1, 2, 4] {
                 let before = kept[j];
                 let Some(after) = before.checked_add_signed(step) else {

@@ -80,6 +80,9 @@ fn improve<const D: usize>(search: &mut Search<'_, D>, kept: &mut Vec<usize>) ->
     loop {
         let before = sum;
         for j in 1..kept.len() - 1 {
+            if search.effort > EFFORT {
+                return sum;
+            }
             for step in [-8, -4, -2, -1, 1, 2, 4, 8] {
                 let old = kept[j];
                 let Some(new) = old.checked_add_signed(step) else {
@@ -100,9 +103,6 @@ fn improve<const D: usize>(search: &mut Search<'_, D>, kept: &mut Vec<usize>) ->
                     kept[j] = old;
                 }
             }
-        }
-        if search.effort > EFFORT {
-            return sum;
         }
         if !(sum < 0.999 * before) && !swap(search, kept, &mut sum) {
             return sum;
