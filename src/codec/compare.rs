@@ -64,7 +64,9 @@ impl Row {
                 .map(|(r, c)| c.largest_m(r))
                 .fold(0.0, f64::max),
             rms_error_m: (lost.sum() / samples as f64).sqrt(),
-            r_squared: [0, 1, 2].map(|d| (all[d] > 0.0).then(|| 1.0 - lost[d] / all[d])),
+            // A nanometre is rounding, not motion.
+            r_squared: [0, 1, 2]
+                .map(|d| (all[d] > 1e-18 * samples as f64).then(|| 1.0 - lost[d] / all[d])),
         })
     }
 }

@@ -2,8 +2,8 @@
 
 use nalgebra::SVector;
 
-use super::super::{CheckpointError, Grid, MAX_POINTS, Plan, check_series};
 use super::super::plan::MAX_STEPS;
+use super::super::{CheckpointError, Grid, MAX_POINTS, Plan, check_series};
 use super::search::{Motion, Search};
 
 /// Sample evaluations spent on moving points.
