@@ -139,8 +139,9 @@ impl<const D: usize> LeastSquares<D> {
             for i in 0..4.min(count - first) {
                 let weighted = w * row[i];
                 self.unknown[first + i] += y * weighted;
-                for j in i..4.min(count - first) {
-                    self.band[first + i][j - i] += weighted * row[j];
+                let there = 4.min(count - first);
+                for (entry, other) in self.band[first + i].iter_mut().zip(&row[i..there]) {
+                    *entry += weighted * other;
                 }
             }
         }
