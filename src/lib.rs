@@ -16,6 +16,7 @@ pub mod ground;
 mod ingest;
 pub mod measure;
 mod paper;
+mod picture;
 mod recognise;
 pub mod relay;
 mod select;

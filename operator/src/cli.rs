@@ -5,6 +5,7 @@ mod played;
 mod report;
 mod skills;
 
+use std::collections::BTreeMap;
 use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -18,6 +19,7 @@ use telemime_endpoint::{Fingerprint, HostClock, Identity, Meter, Mono, quic};
 use tokio::sync::mpsc;
 
 use crate::daemon::Daemon;
+use crate::placed::Placed;
 use crate::session::{FutureBound, SessionConfig};
 use crate::task::{Outcome, Recording, Task};
 pub use infer::{Bounds, infer};
@@ -62,6 +64,14 @@ pub struct Args {
     /// Play this skill: its inferred motion, compressed to checkpoints.
     #[arg(long, value_name = "SKILL")]
     pub play: Option<String>,
+    /// Play: place a frame of the skill anew, m in the recordings' axes; may be repeated. The others stay where they
+    /// usually were; the arm begins wherever it is, so that what counts is where the goal lies from the start.
+    #[arg(
+        long,
+        value_name = "NAME=x,y,z[,qw,qx,qy,qz]",
+        conflicts_with = "replay"
+    )]
+    pub frame: Vec<Placed>,
     /// Play: largest error of the rebuilt motion, m [default: 1 % of the skill's reach].
     #[arg(long, value_name = "M")]
     pub bound: Option<f64>,
@@ -179,6 +189,8 @@ struct File {
     skills: Vec<PathBuf>,
     replay: Option<PathBuf>,
     play: Option<String>,
+    #[serde(default)]
+    frames: BTreeMap<String, Vec<f64>>,
     bound_m: Option<f64>,
     turn_bound_rad: Option<f64>,
     scale: Option<f64>,
@@ -222,6 +234,14 @@ impl Args {
         self.matching = self.matching.or(file.matching);
         if self.replay.is_none() && self.play.is_none() {
             (self.replay, self.play) = (file.replay, file.play);
+        }
+        if self.frame.is_empty() && self.play.is_some() {
+            self.frame = file
+                .frames
+                .iter()
+                .map(|(name, numbers)| Placed::new(name, numbers))
+                .collect::<Result<_, _>>()
+                .with_context(|| format!("{}: [frames]", path.display()))?;
         }
         self.bound = self.bound.or(file.bound_m);
         self.turn_bound = self.turn_bound.or(file.turn_bound_rad);
@@ -386,9 +406,11 @@ fn make_task(
                 place_m: args.bound.unwrap_or(derived.place_m),
                 turn_rad: args.turn_bound.unwrap_or(derived.turn_rad),
             };
-            let (plan, report) = infer(&skill, bounds)?;
+            let (plan, report) = infer(&skill, bounds, &args.frame)?;
             log.say(&Event::Plan(report));
-            let played = Played::new(plan.curve()?, skills.aligned(name), rotation);
+            // Demonstrations that went elsewhere are no measure of a motion with its frames moved.
+            let shown = skills.aligned(name).filter(|_| args.frame.is_empty());
+            let played = Played::new(plan.curve()?, shown, rotation);
             Ok((Task::play(plan), Some(played)))
         }
         _ => bail!("what to do? Give --replay FILE or --play SKILL"),
@@ -465,6 +487,7 @@ mod tests {
             .replace("# bound_m", "bound_m")
             .replace("# turn_bound_rad", "turn_bound_rad");
         let file: File = toml::from_str(&example).unwrap();
+        assert!(!file.frames.is_empty(), "[frames] is missing");
         assert!(!format!("{file:?}").contains("None"), "a key is missing");
         parse_future_bound(&file.future_bound.unwrap()).unwrap();
     }

@@ -1,6 +1,8 @@
 //! Recorded demonstrations: `t,x,y,z[,qw,qx,qy,qz][,grip]` CSV, one file each; a folder is a skill.
+//! Comment lines may place objects: `# frame NAME x y z [qw qx qy qz]`.
 
 mod error;
+pub(crate) mod frames;
 
 /// Whether `name` matches `pattern`, in which `*` stands for any text. Each piece between stars is taken where
 /// it first occurs, which never rules a later one out.
@@ -31,6 +33,7 @@ use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use sha2::{Digest, Sha256};
 
 use telemime_protocol::pose;
+use telemime_protocol::skill::Placement;
 
 pub use error::{DemonstrationError, Notice};
 
@@ -78,6 +81,7 @@ pub struct Demonstration {
     name: String,
     path: PathBuf,
     samples: Vec<Sample>,
+    frames: Vec<(String, Placement)>,
     sha256: [u8; 32],
     columns: Vec<String>,
     notices: Vec<Notice>,
@@ -236,6 +240,7 @@ impl Demonstration {
             name: path
                 .file_stem()
                 .map_or_else(String::new, |s| s.to_string_lossy().into_owned()),
+            frames: frames::parse(&path, bytes)?,
             path,
             samples,
             sha256: Sha256::digest(bytes).into(),
@@ -252,7 +257,7 @@ impl Demonstration {
         name: impl Into<PathBuf>,
         samples: &[Sample],
     ) -> Result<Self, DemonstrationError> {
-        Self::parse(name, csv_text(samples).as_bytes())
+        Self::parse(name, csv_text(&[], samples).as_bytes())
     }
 
     /// Whether every sample has an orientation.
@@ -265,9 +270,14 @@ impl Demonstration {
         self.samples.iter().all(|s| s.grip.is_some())
     }
 
-    /// Its samples as CSV; reading that back gives the same numbers.
+    /// Its samples and frames as CSV; reading that back gives the same numbers.
     pub fn to_csv(&self) -> String {
-        csv_text(&self.samples)
+        csv_text(&self.frames, &self.samples)
+    }
+
+    /// The frames its comment lines `# frame NAME x y z [qw qx qy qz]` place (m), in the order of the file.
+    pub fn frames(&self) -> &[(String, Placement)] {
+        &self.frames
     }
 
     /// The file's name without folder and extension.
@@ -462,8 +472,9 @@ fn csv_error(path: &Path, error: &csv::Error) -> DemonstrationError {
 }
 
 /// A column that not every sample has is left out.
-fn csv_text(samples: &[Sample]) -> String {
-    let mut text = String::from("t,x,y,z");
+fn csv_text(frames: &[(String, Placement)], samples: &[Sample]) -> String {
+    let mut text = frames::to_text(frames);
+    text += "t,x,y,z";
     let turns = samples.iter().all(|s| s.orientation.is_some());
     let grips = samples.iter().all(|s| s.grip.is_some());
     text += if turns { ",qw,qx,qy,qz" } else { "" };

@@ -6,6 +6,7 @@ pub mod daemon;
 pub mod demonstration;
 pub mod ingest;
 pub mod learn;
+pub mod placed;
 pub mod recognise;
 pub mod session;
 pub mod skill_file;

@@ -191,6 +191,25 @@ fn a_steady_turn_is_met_without_lag() {
 }
 
 #[test]
+fn messages_without_orientation_do_not_take_the_turn_back() {
+    let mut bench = Bench::new();
+    let start = bench.engage(bench.mirror(bench.held(hand()), None));
+    bench.run(600, |b| (b.held(hand()), None));
+    let (axis, speed) = (Vector3::z(), 0.8);
+    let mut news = Some(turning(hand(), axis * speed));
+    let first = bench.run(50, |_| (news.take(), None));
+    let mut before = since(&first, &start).norm();
+    for _ in 0..60 {
+        let now = bench.run(10, |_| (None, None));
+        let turned = since(&now, &start).norm();
+        assert!(turned > before - 1e-3, "{turned} after {before} rad");
+        before = turned;
+    }
+    // 650 ms after the one forecast there was.
+    assert!((before - 0.65 * speed).abs() < 0.01, "{before} rad");
+}
+
+#[test]
 fn an_orientation_that_appears_later_has_no_reference_and_is_not_followed() {
     let mut bench = Bench::new();
     let start = bench.engage(bench.mirror(None, None));

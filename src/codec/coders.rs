@@ -130,10 +130,14 @@ fn knot_bytes(knots: &[PathKnot]) -> usize {
     for knot in knots {
         let (tick, x) = before.map_or((knot.tick, knot.x), |k| (k.tick, k.x));
         bytes += varint((knot.tick - tick).unsigned_abs() << 1);
-        for d in 0..3 {
-            bytes += signed_varint(i64::from(knot.x[d]) - i64::from(x[d]));
-            bytes += signed_varint(i64::from(knot.v[d]));
+        for (now, before) in knot.x.iter().zip(x) {
+            bytes += signed_varint(i64::from(*now) - i64::from(before));
         }
+        bytes += knot
+            .v
+            .iter()
+            .map(|v| signed_varint(i64::from(*v)))
+            .sum::<usize>();
         before = Some(knot);
     }
     bytes

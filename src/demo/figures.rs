@@ -7,8 +7,9 @@ use nalgebra::{SVector, Vector3};
 use telemime_operator::cli::Event as Operator;
 use telemime_operator::demonstration::Demonstrations;
 use telemime_operator::learn::align::align;
+use telemime_operator::placed::Motion;
 use telemime_operator::skill_file;
-use telemime_protocol::skill::{Gmr, Skill};
+use telemime_protocol::skill::{Gmr, Skill, chi_squared_quantile};
 
 use super::judge::{Verdict, joined};
 use super::processes::Run;
@@ -17,9 +18,10 @@ use crate::figure::{
     BLACK, BLUE, Figure, GREEN, GREY, Layer, ORANGE, Panel, SKY, Shape, VERMILLION,
 };
 use crate::measure::Track;
+use crate::picture::{self, Subject};
 
-/// Standard deviations on either side that hold 90 % of a normal variable.
-const NINETY: f64 = 1.645;
+/// Share of performances that the region drawn is to hold.
+const SHARE: f64 = 0.9;
 
 /// Curves are drawn through this many points.
 const POINTS: usize = 700;
@@ -76,10 +78,11 @@ pub(super) fn tube_panel(material: &Material, skill: &Skill, d: usize) -> anyhow
     learned.retain(|demo| skill.was_trained_on(demo.sha256()));
     let aligned = align(&learned)?;
     let times = (0..=200).map(|i| skill.duration_s() * f64::from(i) / 200.0);
+    let radius = chi_squared_quantile(SHARE, 1).unwrap_or_default().sqrt();
     let (mut mean, mut band) = (Vec::new(), Vec::new());
     for t in times {
         let at = gmr.query(&SVector::from([t]));
-        let half = NINETY * at.covariance[(d, d)].max(0.0).sqrt();
+        let half = radius * at.covariance[(d, d)].max(0.0).sqrt();
         mean.push((t, at.mean[d]));
         band.push((t, at.mean[d] - half, at.mean[d] + half));
     }
@@ -247,7 +250,25 @@ pub(super) fn mirror(
             tube_panel(material, &skill, busiest(&verdict.truth))?,
         ],
     };
-    save(args, &figure, "mirror")
+    let mut shown = save(args, &figure, "mirror")?;
+    shown.extend(learned(args, material, &skill)?);
+    Ok(shown)
+}
+
+/// The picture of what was learned.
+pub(super) fn learned(
+    args: &Args,
+    material: &Material,
+    skill: &Skill,
+) -> anyhow::Result<Vec<PathBuf>> {
+    let subject = Subject {
+        skill,
+        motion: &Motion::new(skill, &[])?,
+        demonstrations: &picture::learned_from(skill, &material.demos)?,
+        truth: None,
+        confidence: 0.95,
+    };
+    save(args, &picture::figure(&subject)?, "skill")
 }
 
 /// Writes a figure under the output folder as PNG and SVG.

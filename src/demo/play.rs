@@ -8,7 +8,7 @@ use telemime_operator::demonstration::Demonstrations;
 use telemime_operator::learn::align::align;
 use telemime_protocol::spline::{BSpline, End};
 
-use super::figures::{AXES, load_skill, save, tube_panel};
+use super::figures::{AXES, learned, load_skill, save, tube_panel};
 use super::judge::{engagement, read_ticks};
 use super::processes::Run;
 use super::summary::{arm, deliver, servo};
@@ -138,7 +138,8 @@ pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Res
             error,
         ],
     };
-    let shown = save(args, &figure, "play")?;
+    let mut shown = save(args, &figure, "play")?;
+    shown.extend(learned(args, material, &skill)?);
     deliver(args, table(&result), &result, &shown)
 }
 

@@ -8,8 +8,8 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::theme::{
-    AXIS, DOT, FONT, GRID, INK, LABEL, LINE, MARGIN, NOTE, PANEL, PANEL_TITLE, SOFT_INK, TICK,
-    TITLE, load_font, pale,
+    AXIS, DOT, FONT, GRID, INK, LABEL, LINE, MARGIN, NOTE, PANEL, PANEL_TITLE, SOFT_INK, THIN,
+    TICK, TITLE, load_font, pale,
 };
 use super::{Figure, FigureError, Layer, Panel, Shape};
 
@@ -207,7 +207,7 @@ where
         let (a, b) = ((x, y), (x + swatch, y));
         let centre = (x + swatch / 2, y);
         match &one.shape {
-            Shape::Line(_) => area.draw(&PathElement::new([a, b], line)),
+            Shape::Line(_) | Shape::Thin(_) => area.draw(&PathElement::new([a, b], line)),
             Shape::Dashed(_) => {
                 let gap = swatch / 7;
                 (0..3).try_for_each(|i| {
@@ -245,12 +245,12 @@ where
     let fill = pale(layer.colour).filled();
     match &layer.shape {
         // A path turns back on itself, and a mitred join of such a turn is a spike.
-        Shape::Line(p) if equal_axes => {
+        Shape::Line(p) | Shape::Thin(p) if equal_axes => {
             let p: Vec<_> = finite(p).collect();
             axes.draw_series(p.windows(2).map(|w| PathElement::new(w.to_vec(), line)))
                 .map(|_| ())
         }
-        Shape::Line(p) => axes
+        Shape::Line(p) | Shape::Thin(p) => axes
             .draw_series(LineSeries::new(finite(p), line))
             .map(|_| ()),
         Shape::Dashed(p) => axes
@@ -324,7 +324,11 @@ fn ranges(
     };
     for layer in &panel.layers {
         match &layer.shape {
-            Shape::Line(p) | Shape::Dashed(p) | Shape::Dots(p) | Shape::Rings(p) => {
+            Shape::Line(p)
+            | Shape::Thin(p)
+            | Shape::Dashed(p)
+            | Shape::Dots(p)
+            | Shape::Rings(p) => {
                 p.iter().for_each(|p| reach(p.0, p.1, 0.0));
             }
             Shape::Tube(p, radius) => p.iter().for_each(|p| reach(p.0, p.1, *radius)),
@@ -360,7 +364,13 @@ fn finite(points: &[(f64, f64)]) -> impl Iterator<Item = (f64, f64)> + Clone + '
 }
 
 fn stroke(layer: &Layer, k: f64) -> ShapeStyle {
-    layer.colour.stroke_width((LINE * k).round() as u32)
+    let width = match layer.shape {
+        Shape::Thin(_) => THIN,
+        _ => LINE,
+    };
+    layer
+        .colour
+        .stroke_width((width * k).round().max(1.0) as u32)
 }
 
 fn text(size: f64, colour: RGBColor) -> TextStyle<'static> {

@@ -58,6 +58,8 @@ pub(crate) struct Layer {
 pub(crate) enum Shape {
     /// Points joined by a line.
     Line(Vec<(f64, f64)>),
+    /// The same, thinner: for many alike.
+    Thin(Vec<(f64, f64)>),
     /// The same, dashed.
     Dashed(Vec<(f64, f64)>),
     /// The area between two curves over the same abscissa: (x, low, high).

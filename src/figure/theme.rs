@@ -30,6 +30,7 @@ pub(super) const PANEL_TITLE: f64 = 15.0;
 pub(super) const LABEL: f64 = 13.0;
 pub(super) const TICK: f64 = 12.0;
 pub(super) const LINE: f64 = 1.9;
+pub(super) const THIN: f64 = 1.0;
 pub(super) const DOT: f64 = 3.6;
 
 /// `colour` mixed with white: opaque, so that overlapping parts of one shape do not show.

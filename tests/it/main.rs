@@ -4,19 +4,23 @@
     reason = "clippy.toml allows it in tests, but does not know these helpers for tests"
 )]
 
+mod alignment;
 mod arms;
 mod codec;
 mod commands;
 mod data;
+mod frames;
 mod ingest;
 mod layout;
 mod mirror;
 mod paper;
+mod picture;
 mod play;
 mod prediction;
 mod processes;
 mod protocol;
 mod recognition;
+mod refinement;
 mod safety;
 mod scene;
 mod selection;

@@ -376,5 +376,7 @@ fn the_demo_gives_one_json_object_and_its_figures() {
         "more than one line on stdout"
     );
     assert!(demo.end().0.success());
-    assert!(out.join("mirror.png").exists() && out.join("mirror.svg").exists());
+    for figure in ["mirror.png", "mirror.svg", "skill.png", "skill.svg"] {
+        assert!(out.join(figure).exists(), "{figure}");
+    }
 }

@@ -141,7 +141,7 @@ fn a_pose_is_played_to_the_tip() {
         place_m: 0.005,
         turn_rad: 0.01,
     };
-    let (plan, report) = infer(&skill, bounds).unwrap();
+    let (plan, report) = infer(&skill, bounds, &[]).unwrap();
     assert!(report.rebuilt_turn.unwrap().max_rad <= bounds.turn_rad + 1e-9);
     let curve = plan.curve().unwrap();
     let rig = rig();

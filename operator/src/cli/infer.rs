@@ -1,12 +1,13 @@
 //! A skill's motion to play: regression over time, compressed to checkpoints within a bound.
 
 use anyhow::Context;
-use nalgebra::{SVector, UnitQuaternion, Vector1, Vector3};
+use nalgebra::{UnitQuaternion, Vector1, Vector3};
 use telemime_protocol::checkpoint::{PosePlan, select, turns};
 use telemime_protocol::skill::{Gmr, Skill};
 use telemime_protocol::wire::codec;
 
 use super::report::{PlayReport, Scores, TurnScores};
+use crate::placed::{Motion, Placed};
 
 /// Inferred motions are sampled at this interval before they are compressed, s.
 const SAMPLE_S: f64 = 0.02;
@@ -33,25 +34,26 @@ impl Bounds {
     }
 }
 
-/// Infers the skill's motion and compresses it.
+/// Infers the skill's motion, with these of its frames placed anew, and compresses it.
 ///
 /// # Errors
-/// A bound that cannot be held.
-pub fn infer(skill: &Skill, bounds: Bounds) -> anyhow::Result<(PosePlan, PlayReport)> {
-    let gmr = Gmr::<1, 3>::new(skill.motion())?;
+/// A bound that cannot be held, or a frame that cannot be placed.
+pub fn infer(
+    skill: &Skill,
+    bounds: Bounds,
+    placed: &[Placed],
+) -> anyhow::Result<(PosePlan, PlayReport)> {
+    let motion = Motion::new(skill, placed)?;
     let steps = (skill.duration_s() / SAMPLE_S).ceil().max(2.0) as usize;
     let t: Vec<f64> = (0..=steps)
         .map(|i| skill.duration_s() * i as f64 / steps as f64)
         .collect();
-    let inferred: Vec<Vector3<f64>> = t
-        .iter()
-        .map(|&t| gmr.query(&SVector::from([t])).mean)
-        .collect();
+    let inferred: Vec<Vector3<f64>> = t.iter().map(|&t| motion.at(t).mean).collect();
     let position = select::bounded(&t, &inferred, bounds.place_m)
         .with_context(|| format!("--bound {}", bounds.place_m))?;
     let turned: Option<Vec<UnitQuaternion<f64>>> = skill
         .turn()
-        .map(|turn| t.iter().map(|&t| turn.motion.query(t).mean).collect());
+        .and_then(|_| t.iter().map(|&t| motion.turn_at(t)).collect());
     let orientation = turned
         .as_ref()
         .map(|q| turns(&t, q, bounds.turn_rad))
@@ -61,7 +63,7 @@ pub fn infer(skill: &Skill, bounds: Bounds) -> anyhow::Result<(PosePlan, PlayRep
         .grip()
         .map(|grip| -> anyhow::Result<_> {
             let gmr = Gmr::<1, 1>::new(grip)?;
-            let opening = |&t: &f64| gmr.query(&SVector::from([t])).mean[0].clamp(0.0, 1.0);
+            let opening = |&t: &f64| gmr.query(&Vector1::new(t)).mean[0].clamp(0.0, 1.0);
             let openings: Vec<_> = t.iter().map(|t| Vector1::new(opening(t))).collect();
             Ok(select::bounded(&t, &openings, GRIP_BOUND)?)
         })
@@ -108,7 +110,7 @@ mod tests {
             place_m: 2e-3,
             turn_rad: 0.01,
         };
-        let (plan, report) = infer(&skill, bounds).unwrap();
+        let (plan, report) = infer(&skill, bounds, &[]).unwrap();
         let curve = plan.curve().unwrap();
         assert!(report.rebuilt.max_m <= bounds.place_m + 1e-9);
         let turned = report.rebuilt_turn.unwrap();

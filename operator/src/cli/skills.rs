@@ -10,6 +10,7 @@ use super::Args;
 use super::report::{Event, Log};
 use crate::demonstration::{Demonstration, Demonstrations};
 use crate::learn::align::{Aligned, align};
+use crate::learn::frames::{GOAL, START};
 use crate::learn::{LearnOptions, Progress, learn_skill};
 use crate::recognise::{RecogniseOptions, Recogniser};
 use crate::skill_file;
@@ -36,6 +37,7 @@ impl Skills {
         let mut pooled: Vec<Demonstration> = Vec::new();
         let options = LearnOptions {
             seed: args.seed.unwrap_or(0),
+            frames: frames_asked(args),
             ..LearnOptions::default()
         };
         for dir in &args.learn {
@@ -70,6 +72,7 @@ impl Skills {
                 (SHARED_COMPONENTS * args.learn.len()).min(MAX_COMPONENTS);
             // Only its predictor is used: one time axis for different motions means nothing.
             shared.motion_components = 1..=1;
+            shared.frames.clear();
             let name: Vec<_> = skills
                 .all
                 .iter()
@@ -159,6 +162,20 @@ impl Skills {
         }
         Ok(recording)
     }
+}
+
+/// What is to be placed must be learned: both ends, and every object that is named.
+fn frames_asked(args: &Args) -> Vec<String> {
+    if args.frame.is_empty() {
+        return Vec::new();
+    }
+    let mut frames = vec![START.to_owned(), GOAL.to_owned()];
+    for placed in &args.frame {
+        if !frames.contains(&placed.name) {
+            frames.push(placed.name.clone());
+        }
+    }
+    frames
 }
 
 /// Leaves out the recording that will be replayed, by path and by content.

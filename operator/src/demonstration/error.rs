@@ -101,6 +101,16 @@ pub enum DemonstrationError {
         /// The opening.
         value: f64,
     },
+    /// A comment that begins with the word `frame` and places none.
+    #[error("{}, line {line}: {why}; write `# frame NAME x y z [qw qx qy qz]` (m), or begin the comment with another word", path.display())]
+    Frame {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: u64,
+        /// What is wrong with it.
+        why: String,
+    },
     /// Time stands still or runs backwards.
     #[error("{}, line {line}: t = {t_s} s is not after the previous {previous_s} s; sort by time and remove repeated lines", path.display())]
     Unordered {

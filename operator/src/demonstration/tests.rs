@@ -227,3 +227,47 @@ fn a_faulty_orientation_or_gripper_is_refused() {
     says(refused(4, "0.2,1,2,3,1,0,0,0,1.5"), "line 4: grip is 1.5");
     says(refused(4, "0.2,1,2,3,1,0,0,0,nan"), "line 4: grip is NaN");
 }
+
+#[test]
+fn frames_are_read_kept_and_no_part_of_the_motion() {
+    let take = |frames: &[&str]| {
+        let mut rows = frames.iter().map(|f| (*f).to_owned()).collect::<Vec<_>>();
+        rows.extend(good("t,x,y,z", |i| format!("{},{},2,3", i as f64 * 0.1, i)));
+        lines(&rows.iter().map(String::as_str).collect::<Vec<_>>())
+    };
+    let plain = take(&["# any remark", "#framed, not a frame"]).unwrap();
+    assert!(plain.frames().is_empty());
+    let d = take(&[
+        "# frame cup 0.5 -0.1 2",
+        "#frame lid 1 2 3 0.7071068 0 0 0.7071068",
+    ])
+    .unwrap();
+    assert_eq!(d.samples(), plain.samples());
+    let [(cup, at), (lid, turned)] = d.frames() else {
+        panic!("{:?}", d.frames());
+    };
+    assert_eq!((cup.as_str(), lid.as_str()), ("cup", "lid"));
+    assert_eq!(at.origin, Vector3::new(0.5, -0.1, 2.0));
+    assert!((turned.turn * Vector3::x() - Vector3::y()).norm() < 1e-6);
+    let again = Demonstration::parse("skill/take.csv", d.to_csv().as_bytes()).unwrap();
+    assert_eq!(again.frames()[0], d.frames()[0]);
+    assert!((again.frames()[1].1.turn.coords - turned.turn.coords).norm() < 1e-15);
+
+    for (bad, why) in [
+        ("# frame", "line 2: the name is missing"),
+        ("# frame cup 1 2", "line 2: 2 numbers, where three"),
+        (
+            "# frame cup 1 2 z",
+            "line 2: \"z\" is not a number; write `# frame NAME",
+        ),
+        ("# frame cup 1 2 inf", "line 2: a number is not finite"),
+        ("# frame cup 1 2 3 1 1 0 0", "have norm 1.4142"),
+        ("# frame hat 1 2 3", "\"hat\" is placed a second time"),
+    ] {
+        let error = take(&["# frame hat 0 0 0", bad]).unwrap_err().to_string();
+        assert!(
+            error.contains(why) && error.contains("skill/take.csv, line 2"),
+            "{bad}: {error}"
+        );
+    }
+}

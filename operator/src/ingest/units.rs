@@ -88,7 +88,8 @@ impl TimeUnit {
 /// use telemime_operator::ingest::Axes;
 /// // Unity (x right, y up, z forward) to a robot's base (x forward, y left, z up).
 /// let axes: Axes = "z,-x,y".parse()?;
-/// assert_eq!(axes.position([1.0, 2.0, 3.0].into()), [3.0, -1.0, 2.0].into());
+/// let ours = axes.position([1.0, 2.0, 3.0].into());
+/// assert_eq!([ours.x, ours.y, ours.z], [3.0, -1.0, 2.0]);
 /// # Ok::<(), String>(())
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,12 +1,13 @@
-//! One time axis for all demonstrations: dynamic time warping to the medoid (Sakoe & Chiba 1978).
+//! One time axis for all demonstrations: the medoid by dynamic time warping (Sakoe & Chiba 1978), and a warp
+//! to it that ascends at every step (`warp`).
 
 use nalgebra::Vector3;
 
-use super::LearnError;
+use super::{LearnError, warp};
 use crate::demonstration::Demonstration;
 
 /// Points on the common axis, at most and at least.
-const POINTS: (usize, usize) = (30, 200);
+pub(super) const POINTS: (usize, usize) = (30, 200);
 
 /// How far a warp may stray from proportional time, as a share of the axis.
 const BAND: f64 = 0.25;
@@ -22,8 +23,37 @@ pub struct Aligned {
     pub times_s: Vec<f64>,
     /// For each demonstration its position (m) at each of `times_s`.
     pub paths: Vec<Vec<Vector3<f64>>>,
-    /// For each demonstration the moment (s from its own start) that belongs to each of `times_s`.
+    /// For each demonstration the moment (s from its own start) that belongs to each of `times_s`; strictly
+    /// ascending, from 0 to its duration.
     pub warps_s: Vec<Vec<f64>>,
+}
+
+impl Aligned {
+    /// How far through the motion demonstration `index` (of those aligned) is `own_s` seconds after its own
+    /// start: the phase, from 0 to 1, linear between the points of the axis.
+    ///
+    /// # Panics
+    /// If there is no such demonstration.
+    pub fn phase(&self, index: usize, own_s: f64) -> f64 {
+        let warp_s = &self.warps_s[index];
+        let last = warp_s.len() - 1;
+        let i = warp_s.partition_point(|w| *w <= own_s).clamp(1, last) - 1;
+        let part = (own_s - warp_s[i]) / (warp_s[i + 1] - warp_s[i]);
+        (i as f64 + part.clamp(0.0, 1.0)) / last as f64
+    }
+
+    /// The phase of every sample of demonstration `index`, which is `demonstration`: strictly ascending from 0
+    /// to 1.
+    ///
+    /// # Panics
+    /// If there is no such demonstration.
+    pub fn phases(&self, index: usize, demonstration: &Demonstration) -> Vec<f64> {
+        let start_s = demonstration.samples()[0].t_s;
+        let samples = demonstration.samples().iter();
+        samples
+            .map(|s| self.phase(index, s.t_s - start_s))
+            .collect()
+    }
 }
 
 /// Aligns demonstrations of any lengths and rates to their medoid and gives them the mean duration.
@@ -88,6 +118,19 @@ pub fn align(demonstrations: &[Demonstration]) -> Result<Aligned, LearnError> {
     })
 }
 
+/// The moments (s from its own start) of a demonstration that belong to the points of `path`, which are at equal
+/// steps of its time; at least two. Shapes are compared as [`align`] does.
+pub fn warp_to(path: &[Vector3<f64>], d: &Demonstration) -> Vec<f64> {
+    let last = (path.len() - 1) as f64;
+    let mut centred = path.to_vec();
+    centre(&mut centred);
+    Warp::new(&centred, &shape(d, path.len()))
+        .phases()
+        .into_iter()
+        .map(|phase| phase / last * d.duration_s())
+        .collect()
+}
+
 /// A demonstration at `points` equal steps of its own time, about the centre of its bounding box
 /// (which, unlike the mean, does not depend on the pace).
 fn shape(d: &Demonstration, points: usize) -> Vec<Vector3<f64>> {
@@ -96,21 +139,28 @@ fn shape(d: &Demonstration, points: usize) -> Vec<Vector3<f64>> {
     let mut path: Vec<_> = (0..points)
         .map(|i| d.position_at(start_s + i as f64 * step_s))
         .collect();
+    centre(&mut path);
+    path
+}
+
+fn centre(path: &mut [Vector3<f64>]) {
     let low = path.iter().fold(path[0], |a, p| a.inf(p));
     let high = path.iter().fold(path[0], |a, p| a.sup(p));
     let centre = (low + high) * 0.5;
     path.iter_mut().for_each(|p| *p -= centre);
-    path
 }
 
-/// The table of least costs between two paths of the same number of points.
-struct Warp {
-    points: usize,
-    table: Vec<f64>,
+/// How two paths of the same number of points differ when their timing does not count.
+struct Warp<'a> {
+    a: &'a [Vector3<f64>],
+    b: &'a [Vector3<f64>],
+    cost: f64,
 }
 
-impl Warp {
-    fn new(a: &[Vector3<f64>], b: &[Vector3<f64>]) -> Self {
+impl<'a> Warp<'a> {
+    /// The least cost over all warps within the band, which may stop either clock: cheap, and enough to find the
+    /// medoid by.
+    fn new(a: &'a [Vector3<f64>], b: &'a [Vector3<f64>]) -> Self {
         let n = a.len();
         let band = (BAND * n as f64).ceil() as usize;
         let mut table = vec![f64::INFINITY; n * n];
@@ -127,39 +177,22 @@ impl Warp {
                 table[i * n + j] = before + (a[i] - b[j]).norm_squared();
             }
         }
-        Self { points: n, table }
+        Self {
+            a,
+            b,
+            cost: table[n * n - 1],
+        }
     }
 
     fn cost(&self) -> f64 {
-        self.table[self.table.len() - 1]
+        self.cost
     }
 
-    /// For each point of the first path the mean index of the points of the second that belong to it;
-    /// ascending, from the first to the last point.
+    /// For each point of the first path the (fractional) index of the point of the second that belongs to
+    /// it; strictly ascending, from the first to the last point.
     fn phases(&self) -> Vec<f64> {
-        let n = self.points;
-        let mut sums = vec![(0.0, 0.0); n];
-        let (mut i, mut j) = (n - 1, n - 1);
-        loop {
-            sums[i].0 += j as f64;
-            sums[i].1 += 1.0;
-            if (i, j) == (0, 0) {
-                break;
-            }
-            let at = |i: usize, j: usize| self.table[i * n + j];
-            (i, j) = match (i, j) {
-                (0, _) => (0, j - 1),
-                (_, 0) => (i - 1, 0),
-                // The diagonal first: of equal costs it warps least.
-                _ if at(i - 1, j - 1) <= at(i - 1, j).min(at(i, j - 1)) => (i - 1, j - 1),
-                _ if at(i - 1, j) <= at(i, j - 1) => (i - 1, j),
-                _ => (i, j - 1),
-            };
-        }
-        let mut phases: Vec<f64> = sums.into_iter().map(|(sum, count)| sum / count).collect();
-        phases[0] = 0.0;
-        phases[n - 1] = (n - 1) as f64;
-        phases
+        let band = (BAND * self.a.len() as f64).ceil() as usize;
+        warp::phases(self.a, self.b, band)
     }
 }
 
@@ -201,7 +234,7 @@ mod tests {
             assert!(worst < 0.1, "{worst}");
         }
         for warp in &a.warps_s {
-            assert!(warp.windows(2).all(|w| w[0] <= w[1]));
+            assert!(warp.windows(2).all(|w| w[0] < w[1]));
         }
     }
 
@@ -220,5 +253,25 @@ mod tests {
         let a = align(&[swing("only", 1.0, |u| u, 0.0)]).unwrap();
         assert_eq!((a.medoid, a.paths.len()), (0, 1));
         assert_eq!(align(&[]), Err(LearnError::NoDemonstrations));
+    }
+
+    #[test]
+    fn every_sample_has_its_phase() {
+        let demos = [
+            swing("even", 2.0, |u| u, 0.0),
+            swing("slow start", 3.0, |u| 0.6 * u + 0.4 * u * u, 0.0),
+        ];
+        let a = align(&demos).unwrap();
+        for (index, d) in demos.iter().enumerate() {
+            let phases = a.phases(index, d);
+            assert_eq!((phases[0], phases[59]), (0.0, 1.0));
+            assert!(phases.windows(2).all(|w| w[0] < w[1]));
+            for (i, phase) in phases.iter().enumerate() {
+                let u = i as f64 / 59.0;
+                let truth = if index == 0 { u } else { 0.6 * u + 0.4 * u * u };
+                assert!((phase - truth).abs() < 0.02, "{i}: {phase}, not {truth}");
+            }
+        }
+        assert_eq!((a.phase(1, -1.0), a.phase(1, 9.0)), (0.0, 1.0));
     }
 }

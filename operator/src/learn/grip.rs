@@ -6,9 +6,9 @@ use telemime_protocol::skill::Gmm;
 use super::LearnError;
 use super::align::Aligned;
 use super::em::{self, EmOptions};
+use super::motion::regression_score;
 use super::select::bic_of_means;
 use crate::demonstration::Demonstration;
-use telemime_protocol::skill::Gmr;
 
 /// Numbers of components tried: a gripper opens and closes a few times.
 const LADDER: [usize; 9] = [1, 2, 3, 4, 6, 8, 12, 16, 24];
@@ -44,7 +44,7 @@ pub fn fit(
             ..EmOptions::default()
         };
         let judged = em::fit(&rows, &options)
-            .and_then(|fit| Ok((regression_score(&fit.gmm, &rows)?, fit.gmm)));
+            .and_then(|fit| Ok((regression_score::<2, 1>(&fit.gmm, &rows)?, fit.gmm)));
         match judged {
             Ok((score, gmm)) => {
                 let bic = bic_of_means(gmm.components().len(), 2, score, rows.len());
@@ -58,20 +58,10 @@ pub fn fit(
     best.map(|(_, gmm)| gmm).ok_or(failed)
 }
 
-/// Mean log density (nats a row) of the openings under the regression over time.
-fn regression_score(gmm: &Gmm<2>, rows: &[Vector2<f64>]) -> Result<f64, LearnError> {
-    let gmr = Gmr::<1, 1>::new(gmm).map_err(|_| LearnError::Singular)?;
-    let score = |row: &Vector2<f64>| {
-        let at = gmr.query(&[row[0]].into());
-        let (error, variance) = (row[1] - at.mean[0], at.covariance[(0, 0)]);
-        -0.5 * (error * error / variance + (std::f64::consts::TAU * variance).ln())
-    };
-    Ok(rows.iter().map(score).sum::<f64>() / rows.len() as f64)
-}
-
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector3;
+    use telemime_protocol::skill::Gmr;
 
     use super::*;
     use crate::demonstration::Sample;

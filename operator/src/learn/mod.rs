@@ -3,17 +3,23 @@
 pub mod align;
 pub mod compare;
 pub mod em;
+pub mod frames;
 pub mod grip;
 pub mod kmeans;
 pub mod motion;
 pub mod predictor;
+mod refine;
 pub mod select;
 mod stats;
 #[cfg(test)]
 mod tests;
-mod trial;
+pub(crate) mod trial;
+pub mod tube;
 pub mod turn;
 pub mod variational;
+mod warp;
+
+use std::path::PathBuf;
 
 use telemime_protocol::predict::ModelError;
 use telemime_protocol::skill::{
@@ -24,6 +30,7 @@ use telemime_protocol::skill::{
 use crate::demonstration::Demonstration;
 
 pub use predictor::PredictorOptions;
+pub use refine::{Refinement, refine};
 pub use stats::statistics;
 
 /// Why nothing could be learned.
@@ -76,6 +83,50 @@ pub enum LearnError {
         /// Its value.
         found: f64,
     },
+    /// A demonstration does not say where a frame is.
+    #[error(
+        "{}: no frame {name:?}; add a line `# frame {name} x y z` (m), or learn without it", path.display()
+    )]
+    Frame {
+        /// The frame.
+        name: String,
+        /// The demonstration's file.
+        path: PathBuf,
+    },
+    /// A skill is to be refined by what it was learned from.
+    #[error("{}: the skill was learned from this very recording; give another one", path.display())]
+    AlreadyLearned {
+        /// The demonstration's file.
+        path: PathBuf,
+    },
+    /// A skill is to be refined by a demonstration that shows less than those before.
+    #[error("{}: no {what}, which the skill has; give a recording with those columns", path.display())]
+    Lacks {
+        /// The demonstration's file.
+        path: PathBuf,
+        /// What is missing.
+        what: &'static str,
+    },
+    /// Some demonstrations of a skill show more than others.
+    #[error(
+        "{}: no {what}, which {other} has; give all recordings of a skill those columns, or none", path.display()
+    )]
+    Mixed {
+        /// The demonstration's file that shows less.
+        path: PathBuf,
+        /// What it lacks.
+        what: &'static str,
+        /// The name of one that has it.
+        other: String,
+    },
+    /// An object was seen in one place only.
+    #[error(
+        "frame {name:?}: one demonstration cannot show what follows the object and what does not; give two or more"
+    )]
+    FrameAlone {
+        /// The frame.
+        name: String,
+    },
     /// The data span no volume, and no ridge was allowed.
     #[error("the data lie in a subspace: no mixture of full covariance fits without a ridge")]
     Singular,
@@ -94,6 +145,9 @@ pub struct LearnOptions {
     pub motion_components: std::ops::RangeInclusive<usize>,
     /// The predictor.
     pub predictor: PredictorOptions,
+    /// Frames that the motion is also learned relative to: [`frames::START`], [`frames::GOAL`], and what the
+    /// recordings place by `# frame` lines. None, and it is not.
+    pub frames: Vec<String>,
     /// Seed of every random choice.
     pub seed: u64,
 }
@@ -103,6 +157,7 @@ impl Default for LearnOptions {
         Self {
             motion_components: 1..=MAX_COMPONENTS,
             predictor: PredictorOptions::default(),
+            frames: Vec::new(),
             seed: 0,
         }
     }
@@ -117,6 +172,10 @@ pub enum Progress {
         medoid: String,
         /// Mean duration, s.
         duration_s: f64,
+        /// How far the demonstrations are from their mean in proportional time, m (see [`tube`]).
+        before_m: f64,
+        /// How far aligned, m.
+        after_m: f64,
     },
     /// A number of components was tried for the motion.
     Candidate(select::Candidate),
@@ -128,6 +187,15 @@ pub enum Progress {
         score: f64,
         /// Components that died and were started again or removed, and what floors and shrinkage stand for.
         degenerate: Vec<em::Degenerate>,
+    },
+    /// The motion was learned relative to a frame.
+    Frame {
+        /// Its name.
+        name: String,
+        /// Components.
+        components: usize,
+        /// How far the frame was from its usual place in the demonstrations, root mean square, m.
+        spread_m: f64,
     },
     /// A predictor was trained without one demonstration and tried on it.
     Held {
@@ -163,19 +231,34 @@ pub fn learn_skill(
             limit: MAX_SOURCES,
         });
     }
+    let turns = all_or_none(demonstrations, ORIENTATION, Demonstration::has_orientation)?;
+    let grips = all_or_none(demonstrations, GRIP, Demonstration::has_grip)?;
     let aligned = align::align(demonstrations)?;
+    let tubes = tube::BeforeAfter::of(demonstrations, &aligned);
     progress(Progress::Aligned {
         medoid: demonstrations[aligned.medoid].name().to_owned(),
         duration_s: aligned.duration_s,
+        before_m: tubes.before.deviation_m(),
+        after_m: tubes.after.deviation_m(),
     });
     let motion = motion::fit(&aligned, options, &mut progress)?;
+    let task = if options.frames.is_empty() {
+        None
+    } else {
+        Some(frames::fit(
+            &aligned,
+            demonstrations,
+            options,
+            &mut progress,
+        )?)
+    };
     let predictor = predictor::train(
         demonstrations,
         &options.predictor,
         options.seed,
         &mut progress,
     )?;
-    let turn = if demonstrations.iter().all(Demonstration::has_orientation) {
+    let turn = if turns {
         Some(Turn {
             motion: turn::fit(&aligned, demonstrations)?,
             predictor: predictor::train_turns(
@@ -188,7 +271,7 @@ pub fn learn_skill(
     } else {
         None
     };
-    let grip = if demonstrations.iter().all(Demonstration::has_grip) {
+    let grip = if grips {
         Some(grip::fit(&aligned, demonstrations, options.seed)?)
     } else {
         None
@@ -201,24 +284,47 @@ pub fn learn_skill(
         predictor,
         turn,
         grip,
-        task: None,
+        task,
         stats: statistics(demonstrations),
         samples: samples(&aligned, demonstrations),
         provenance: provenance(demonstrations, options.seed),
     })?)
 }
 
-/// The log-normal distribution of the durations; never narrower than 5 %, which is all that a handful of
-/// performances can show.
+/// Columns that not every recording has, for people.
+const ORIENTATION: &str = "orientation (qw,qx,qy,qz)";
+const GRIP: &str = "grip";
+
+/// Whether the demonstrations have something.
+fn all_or_none(
+    demonstrations: &[Demonstration],
+    what: &'static str,
+    has: impl Fn(&Demonstration) -> bool,
+) -> Result<bool, LearnError> {
+    let with = demonstrations.iter().find(|d| has(d));
+    let without = demonstrations.iter().find(|d| !has(d));
+    match (with, without) {
+        (Some(with), Some(without)) => Err(LearnError::Mixed {
+            path: without.path().to_owned(),
+            what,
+            other: with.name().to_owned(),
+        }),
+        (with, _) => Ok(with.is_some()),
+    }
+}
+
+/// Durations vary by 5 % at least: a handful of performances cannot show less.
+const LEAST_DEVIATION_LN: f64 = 0.05;
+
+/// The log-normal distribution of the durations.
 fn pace(demonstrations: &[Demonstration]) -> Pace {
-    const LEAST: f64 = 0.05;
     let n = demonstrations.len() as f64;
     let ln: Vec<f64> = demonstrations.iter().map(|d| d.duration_s().ln()).collect();
     let mean_ln_s = ln.iter().sum::<f64>() / n;
     let square = ln.iter().map(|v| (v - mean_ln_s).powi(2)).sum::<f64>();
     Pace {
         mean_ln_s,
-        deviation_ln: (square / (n - 1.0).max(1.0)).sqrt().max(LEAST),
+        deviation_ln: (square / (n - 1.0).max(1.0)).sqrt().max(LEAST_DEVIATION_LN),
     }
 }
 
@@ -226,7 +332,7 @@ fn samples(aligned: &align::Aligned, demonstrations: &[Demonstration]) -> Sample
     let count = |n: usize| u32::try_from(n).unwrap_or(u32::MAX).max(1);
     Samples {
         motion: count(aligned.paths.len() * aligned.times_s.len()),
-        predictor: count(demonstrations.iter().map(|d| d.samples().len()).sum()),
+        predictor: count(demonstrations.iter().map(predictor::row_count).sum()),
     }
 }
 

@@ -1,6 +1,6 @@
 //! The motion to play: a mixture over time and position, of the aligned demonstrations.
 
-use nalgebra::{Matrix3, SVector, Vector3, Vector4};
+use nalgebra::{SMatrix, SVector, Vector3, Vector4};
 use telemime_protocol::skill::{Gmm, Gmr};
 
 use super::align::Aligned;
@@ -67,7 +67,7 @@ pub fn fit(
                 ..EmOptions::default()
             };
             let judged = em::fit(&rows, &em).and_then(|fit| {
-                let score = regression_score(&fit.gmm, &rows)?;
+                let score = regression_score::<4, 3>(&fit.gmm, &rows)?;
                 Ok((score, fit))
             });
             match judged {
@@ -95,22 +95,28 @@ pub fn fit(
     Ok(best.gmm)
 }
 
-/// Mean log density (nats a row) of the positions under the regression over time.
-fn regression_score(gmm: &Gmm<4>, rows: &[Vector4<f64>]) -> Result<f64, LearnError> {
-    let gmr = Gmr::<1, 3>::new(gmm).map_err(|_| LearnError::Singular)?;
+/// Mean log density (nats a row) of all coordinates but the first under their regression over it.
+pub(super) fn regression_score<const D: usize, const O: usize>(
+    gmm: &Gmm<D>,
+    rows: &[SVector<f64, D>],
+) -> Result<f64, LearnError> {
+    let gmr = Gmr::<1, O>::new(gmm).map_err(|_| LearnError::Singular)?;
     let mut sum = 0.0;
     for row in rows {
         let at = gmr.query(&SVector::from([row[0]]));
-        let error = row.fixed_rows::<3>(1) - at.mean;
+        let error = row.fixed_rows::<O>(1) - at.mean;
         sum += normal_log_density(&error, &at.covariance).ok_or(LearnError::Singular)?;
     }
     Ok(sum / rows.len() as f64)
 }
 
 /// ln N(error; 0, covariance), or `None` if the covariance is singular.
-pub(super) fn normal_log_density(error: &Vector3<f64>, covariance: &Matrix3<f64>) -> Option<f64> {
+pub(super) fn normal_log_density<const O: usize>(
+    error: &SVector<f64, O>,
+    covariance: &SMatrix<f64, O, O>,
+) -> Option<f64> {
     let factor = covariance.cholesky()?;
     let distance2 = error.dot(&factor.solve(error));
-    let log_det: f64 = (0..3).map(|d| factor.l_dirty()[(d, d)].ln()).sum();
-    Some(-0.5 * distance2 - log_det - 1.5 * std::f64::consts::TAU.ln())
+    let log_det: f64 = (0..O).map(|d| factor.l_dirty()[(d, d)].ln()).sum();
+    Some(-0.5 * distance2 - log_det - 0.5 * O as f64 * std::f64::consts::TAU.ln())
 }

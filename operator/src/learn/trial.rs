@@ -11,7 +11,7 @@ use super::stats::quantile;
 use crate::demonstration::Demonstration;
 
 /// 90 % quantile of χ² with three degrees of freedom.
-const CHI2_3_90: f64 = 6.251;
+pub(crate) const CHI2_3_90: f64 = 6.251;
 
 /// Variances and novelties below these are a sensor at rest, not precision: m², and none.
 const LEAST_M2: f64 = 1e-8;
@@ -122,6 +122,12 @@ impl<C: Course> Trial<C> {
                 }
             }
         }
+    }
+
+    /// The share of the states tried whose novelty is above `limit`; 0 of none.
+    pub(super) fn beyond(&self, limit: f64) -> f64 {
+        let beyond = self.novelties.iter().filter(|n| **n > limit).count();
+        beyond as f64 / self.novelties.len().max(1) as f64
     }
 
     /// `c_h = q₉₀(NEES)/6.251`; trust and damping by least squares.

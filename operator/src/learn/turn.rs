@@ -2,14 +2,14 @@
 //! Expectation–maximisation as in Zeestraten et al. 2017, §III: every component lives in the tangent
 //! space at its own mean orientation, found by Gauss–Newton.
 
-use nalgebra::{Matrix3, Matrix4, UnitQuaternion, Vector4};
+use nalgebra::{Matrix3, Matrix4, UnitQuaternion, Vector3, Vector4};
 use telemime_protocol::pose;
 use telemime_protocol::skill::{Gmm, TurnMixture};
 
 use super::LearnError;
 use super::align::Aligned;
-use super::em::add_outer;
-use super::em::mirror;
+use super::em::{add_outer, mirror};
+use super::motion::normal_log_density;
 use super::select::bic_of_means;
 use crate::demonstration::Demonstration;
 
@@ -70,7 +70,9 @@ pub fn fit(aligned: &Aligned, demonstrations: &[Demonstration]) -> Result<TurnMi
             continue;
         };
         let components = mixture.charts().len();
-        let score = regression_score(&mixture, &rows);
+        let Some(score) = regression_score(&mixture, &rows) else {
+            continue;
+        };
         let bic = bic_of_means(components, 4, score, rows.len());
         if best.as_ref().is_none_or(|(least, _)| bic < *least) {
             best = Some((bic, mixture));
@@ -106,6 +108,59 @@ fn em(rows: &[Row], k: usize) -> Option<TurnMixture> {
         }
     }
     Some(mixture)
+}
+
+/// Refines a mixture that stands for `n` rows no longer at hand: each component keeps those it had, and shares in
+/// the new ones. What was known of a component is carried to its new mean by parallel transport.
+///
+/// # Errors
+/// [`LearnError::Singular`].
+pub(super) fn update(
+    old: &TurnMixture,
+    n: f64,
+    rows: &[(f64, UnitQuaternion<f64>)],
+) -> Result<TurnMixture, LearnError> {
+    const STEPS: usize = 6;
+    let k = old.charts().len();
+    let mut mixture = old.clone();
+    let mut shares = vec![0.0; rows.len() * k];
+    for _ in 0..STEPS {
+        for ((t_s, q), shares) in rows.iter().zip(shares.chunks_exact_mut(k)) {
+            mixture.responsibilities(*t_s, q, shares);
+        }
+        let mut parts = Vec::with_capacity(k);
+        let mut charts = Vec::with_capacity(k);
+        for (i, (c, before)) in old.gmm().components().iter().zip(old.charts()).enumerate() {
+            let own = || shares.iter().skip(i).step_by(k).copied();
+            let had = c.weight() * n;
+            let total = had + own().sum::<f64>();
+            let new_s = own().zip(rows).map(|(r, row)| r * row.0).sum::<f64>();
+            let t_s = (had * c.mean()[0] + new_s) / total;
+            let new = own().zip(rows.iter().map(|row| row.1));
+            let chart = pose::mean(std::iter::once((had, *before)).chain(new));
+            let chart = chart.ok_or(LearnError::Singular)?;
+            let way = pose::between(before, &chart);
+            let mut carry = Matrix4::identity();
+            let axes = [Vector3::x(), Vector3::y(), Vector3::z()];
+            let turned = Matrix3::from_columns(&axes.map(|v| pose::transported(&v, &way)));
+            carry.fixed_view_mut::<3, 3>(1, 1).copy_from(&turned);
+            let mut scatter = carry * c.covariance() * carry.transpose() * had;
+            let mut add = |t: f64, q: &UnitQuaternion<f64>, r: f64| {
+                let v = pose::between(&chart, q);
+                add_outer(&mut scatter, &Vector4::new(t - t_s, v.x, v.y, v.z), r);
+            };
+            add(c.mean()[0], before, had);
+            own().zip(rows).for_each(|(r, (t, q))| add(*t, q, r));
+            mirror(&mut scatter);
+            parts.push((total, Vector4::new(t_s, 0.0, 0.0, 0.0), scatter / total));
+            charts.push(chart);
+        }
+        let all: f64 = parts.iter().map(|p| p.0).sum();
+        let gmm = Gmm::new(parts.into_iter().map(|(n, m, c)| (n / all, m, c)))
+            .map_err(|_| LearnError::Singular)?;
+        mixture = TurnMixture::new(gmm, charts).map_err(|_| LearnError::Singular)?;
+    }
+    Ok(mixture)
 }
 
 /// What every covariance gets on its diagonal: (s², rad², rad², rad²).
@@ -151,27 +206,18 @@ fn maximise(rows: &[Row], shares: &[f64], k: usize, ridge: &Vector4<f64>) -> Opt
     TurnMixture::new(gmm, charts).ok()
 }
 
-/// Mean log density (nats a row) of the orientations under the regression over time.
-fn regression_score(mixture: &TurnMixture, rows: &[Row]) -> f64 {
+/// Mean log density (nats a row) of the orientations under the regression over time; `None` if that is singular.
+fn regression_score(mixture: &TurnMixture, rows: &[Row]) -> Option<f64> {
     let mut sum = 0.0;
     for (t_s, q) in rows {
         let at = mixture.query(*t_s);
-        let covariance = at.covariance + Matrix3::identity() * f64::MIN_POSITIVE;
-        let Some(factor) = covariance.cholesky() else {
-            return f64::NEG_INFINITY;
-        };
-        let error = pose::between(&at.mean, q);
-        let log_det: f64 = (0..3).map(|d| factor.l_dirty()[(d, d)].ln()).sum();
-        let distance2 = error.dot(&factor.solve(&error));
-        sum -= 0.5 * distance2 + log_det + 1.5 * std::f64::consts::TAU.ln();
+        sum += normal_log_density(&pose::between(&at.mean, q), &at.covariance)?;
     }
-    sum / rows.len() as f64
+    Some(sum / rows.len() as f64)
 }
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector3;
-
     use super::*;
     use crate::demonstration::Sample;
     use crate::learn::align::align;

@@ -8,6 +8,7 @@ use telemime_protocol::time::Stamp;
 use super::RecogniseError;
 use super::foretold::Foretold;
 use super::phase::Phases;
+use crate::learn::trial::CHI2_3_90;
 
 type Features = SVector<f64, FEATURES>;
 type Square = SMatrix<f64, FEATURES, FEATURES>;
@@ -22,9 +23,6 @@ const KNOT: usize = 6;
 
 /// A component with less of the responsibility than this predicts nothing.
 const NEGLIGIBLE: f64 = 1e-9;
-
-/// 90 % quantile of χ² with three degrees of freedom.
-const CHI2_3_90: f64 = 6.251;
 
 /// What the features and what the prediction's error contribute to the novelty. The first alone refuses 91 % of gestures
 /// left out of learning, the second alone 90 %, together 95 %, where 5 % of known ones are refused.

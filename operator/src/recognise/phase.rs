@@ -72,7 +72,7 @@ impl Phases {
     pub(super) fn take(&mut self, f: &SVector<f64, FEATURES>, dt_s: f64, weight: f64) {
         let mut moved = [0.0; PHASES];
         for pace in PACES {
-            let steps = dt_s * pace * self.per_s;
+            let steps = (dt_s * pace * self.per_s).min(PHASES as f64);
             let whole = steps as usize;
             let part = steps - whole as f64;
             for (i, p) in self.belief.iter().enumerate() {

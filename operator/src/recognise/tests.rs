@@ -55,7 +55,8 @@ fn demonstration(gesture: &str, seed: u64) -> Demonstration {
 
 fn quick() -> LearnOptions {
     LearnOptions {
-        motion_components: 6..=6,
+        // Two for each turn of the motion with most turns, and the rests.
+        motion_components: 10..=10,
         predictor: PredictorOptions {
             folds: 4,
             ..PredictorOptions::default()
@@ -356,6 +357,16 @@ fn a_trial_that_cannot_be_is_refused_before_anything_is_learned() {
         run(&two, trial_options(Split::Persons)),
         Err(TrialError::Persons { .. })
     ));
+}
+
+#[test]
+fn a_motion_over_before_it_began_is_still_recognised_without_a_fault() {
+    let mut parts = skills()[0].parts().clone();
+    parts.duration_s = 1e-300;
+    let short = Skill::new(parts).unwrap();
+    let mut r = Recogniser::new([&short], RecogniseOptions::default()).unwrap();
+    let answers = watch(&mut r, &demonstration("circle", 10));
+    assert!(answers.iter().all(|a| (0.0..=1.0).contains(&a.phase)));
 }
 
 proptest! {

@@ -6,8 +6,9 @@ use std::collections::VecDeque;
 
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_protocol::pose;
-use telemime_protocol::predict::{Forecast, HandState, Params, TurnForecast, TurnModel, TurnState};
-use telemime_protocol::predict::{Model, Way};
+use telemime_protocol::predict::{
+    Forecast, HandState, Model, Params, TurnForecast, TurnModel, TurnState, Way,
+};
 use telemime_protocol::time::Stamp;
 
 /// What an error made a sample ago still counts.

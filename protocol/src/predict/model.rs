@@ -145,6 +145,8 @@ pub struct Model {
     /// ln π − Σ ln Lᵢᵢ of each component.
     log_scale: Vec<f64>,
     calibration: Calibration,
+    /// log₂ of the steps its displacements are whole multiples of, if it was decoded.
+    exponents: Option<[i8; MAX_KNOTS]>,
 }
 
 impl Model {
@@ -196,7 +198,20 @@ impl Model {
             components,
             log_scale,
             calibration,
+            exponents: None,
         })
+    }
+
+    /// The same model, known to be in these steps: encoding it again rounds nothing.
+    pub(crate) fn in_steps(self, exponents: [i8; MAX_KNOTS]) -> Self {
+        Self {
+            exponents: Some(exponents),
+            ..self
+        }
+    }
+
+    pub(crate) fn exponents(&self) -> Option<&[i8; MAX_KNOTS]> {
+        self.exponents.as_ref()
     }
 
     /// Number of knots J; the last is J·[`KNOT_SPACING_S`] ahead.

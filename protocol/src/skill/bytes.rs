@@ -3,19 +3,14 @@
 use nalgebra::{Quaternion, SMatrix, SVector, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
+use super::predictor::RawModel;
 use super::{
     Gmm, GmmError, MAX_DURATION_S, MAX_NAME_BYTES, MAX_SKILL_BYTES, MAX_SOURCES, Pace, Parts,
     Placement, Provenance, Samples, Skill, SkillError, SkillId, Stats, TaskFrame, TaskModel, Turn,
     TurnError, TurnMixture, sha256,
 };
-use crate::predict::{
-    BLOCK, Calibration, FEATURES, MAX_KNOTS, Model, ModelError, Params, Regression,
-    Standardisation, TARGETS, TurnModel,
-};
-use crate::wire::codec::{self, DecodeError};
-
-/// Entries of a packed lower triangle of the features' covariance.
-const TRIANGLE: usize = FEATURES * (FEATURES + 1) / 2;
+use crate::predict::TurnModel;
+use crate::wire::codec;
 
 #[derive(Serialize, Deserialize)]
 struct RawSkill {
@@ -74,38 +69,13 @@ struct RawGaussian {
     covariance: [f64; 10],
 }
 
-#[derive(Serialize, Deserialize)]
-struct RawModel {
-    mean: [f32; FEATURES],
-    scale: [f32; FEATURES],
-    /// One factor a knot: its length is the number of knots.
-    covariance: Vec<f32>,
-    straight_m2: Vec<f32>,
-    novelty90: f32,
-    params: [f32; 3],
-    components: Vec<RawRegression>,
-}
-
-/// Everything per knot stops at the model's last knot.
-#[derive(Serialize, Deserialize)]
-struct RawRegression {
-    weight: f32,
-    mean: [f32; FEATURES],
-    /// Lower triangle, row by row.
-    factor: Vec<f32>,
-    target: Vec<f32>,
-    /// Feature by feature.
-    gain: Vec<f32>,
-    residual: Vec<f32>,
-}
-
 pub(super) fn encode(parts: Parts) -> Vec<u8> {
     codec::encode(&RawSkill {
         name: parts.name,
         duration_s: parts.duration_s,
         pace: parts.pace,
         motion: gaussians(&parts.motion),
-        predictor: pack(&parts.predictor),
+        predictor: RawModel::pack(&parts.predictor),
         turn: parts.turn.as_ref().map(pack_turn),
         grip: parts.grip.as_ref().map(|grip| {
             let opening = |c: &super::Component<2>| RawOpening {
@@ -183,7 +153,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Skill, SkillError> {
         motion: mixture(&raw.motion)?,
         duration_s: raw.duration_s,
         pace: raw.pace,
-        predictor: unpack(&raw.predictor)?,
+        predictor: raw.predictor.unpack()?,
         turn: raw.turn.as_ref().map(unpack_turn).transpose()?,
         grip: grip.transpose()?,
         task: frames.transpose()?.map(TaskModel::new).transpose()?,
@@ -260,7 +230,7 @@ fn pack_turn(turn: &Turn) -> RawTurn {
                 covariance: packed(c.covariance()),
             })
             .collect(),
-        predictor: pack(turn.predictor.model()),
+        predictor: RawModel::pack(turn.predictor.model()),
         charts: turn
             .predictor
             .charts()
@@ -289,7 +259,7 @@ fn unpack_turn(raw: &RawTurn) -> Result<Turn, SkillError> {
         .collect::<Result<_, _>>()?;
     Ok(Turn {
         motion: TurnMixture::new(gmm, charts)?,
-        predictor: TurnModel::new(unpack(&raw.predictor)?, predictor_charts)?,
+        predictor: TurnModel::new(raw.predictor.unpack()?, predictor_charts)?,
     })
 }
 
@@ -344,121 +314,7 @@ fn check_provenance(provenance: &Provenance) -> Result<(), SkillError> {
     Ok(())
 }
 
-fn pack(model: &Model) -> RawModel {
-    let knots = model.knots();
-    let calibration = model.calibration();
-    let params = calibration.params;
-    let narrow = |v: &[f64]| v.iter().map(|&v| v as f32).collect::<Vec<_>>();
-    RawModel {
-        mean: model.standardisation().mean.map(|v| v as f32).into(),
-        scale: model.standardisation().scale.map(|v| v as f32).into(),
-        covariance: narrow(&calibration.covariance[..knots]),
-        straight_m2: narrow(&calibration.straight_m2[..knots]),
-        novelty90: calibration.novelty90 as f32,
-        params: [params.gain, params.trust, params.cv_damping].map(|v| v as f32),
-        components: model
-            .components()
-            .iter()
-            .map(|c| RawRegression {
-                weight: c.weight as f32,
-                mean: c.mean.map(|v| v as f32).into(),
-                factor: triangle(FEATURES).map(|at| c.factor[at] as f32).collect(),
-                target: narrow(&c.target[..3 * knots]),
-                gain: c
-                    .gain
-                    .iter()
-                    .flat_map(|row| narrow(&row[..3 * knots]))
-                    .collect(),
-                residual: narrow(c.residual[..knots].as_flattened()),
-            })
-            .collect(),
-    }
-}
-
-fn unpack(raw: &RawModel) -> Result<Model, SkillError> {
-    let knots = raw.covariance.len();
-    if !(1..=MAX_KNOTS).contains(&knots) {
-        return Err(ModelError::Knots { found: knots }.into());
-    }
-    if raw.straight_m2.len() != knots {
-        return Err(wrong_length("straight").into());
-    }
-    let [gain, trust, cv_damping] = raw.params.map(f64::from);
-    let mut calibration = Calibration {
-        covariance: [1.0; MAX_KNOTS],
-        straight_m2: [1.0; MAX_KNOTS],
-        novelty90: f64::from(raw.novelty90),
-        params: Params {
-            gain,
-            trust,
-            cv_damping,
-        },
-    };
-    widen(&mut calibration.covariance, &raw.covariance);
-    widen(&mut calibration.straight_m2, &raw.straight_m2);
-    let components = raw
-        .components
-        .iter()
-        .map(|c| unpack_regression(c, knots))
-        .collect::<Result<_, _>>()?;
-    Ok(Model::new(
-        knots,
-        Standardisation {
-            mean: SVector::from(raw.mean.map(f64::from)),
-            scale: SVector::from(raw.scale.map(f64::from)),
-        },
-        components,
-        calibration,
-    )?)
-}
-
-fn unpack_regression(raw: &RawRegression, knots: usize) -> Result<Regression, DecodeError> {
-    let row = 3 * knots;
-    if raw.factor.len() != TRIANGLE {
-        return Err(wrong_length("factor"));
-    }
-    if raw.target.len() != row {
-        return Err(wrong_length("target"));
-    }
-    if raw.gain.len() != FEATURES * row {
-        return Err(wrong_length("gain"));
-    }
-    if raw.residual.len() != knots * BLOCK {
-        return Err(wrong_length("residual"));
-    }
-    let mut out = Regression {
-        weight: f64::from(raw.weight),
-        mean: SVector::from(raw.mean.map(f64::from)),
-        factor: SMatrix::zeros(),
-        target: [0.0; TARGETS],
-        gain: [[0.0; TARGETS]; FEATURES],
-        residual: [[0.0; BLOCK]; MAX_KNOTS],
-    };
-    for (&v, at) in raw.factor.iter().zip(triangle(FEATURES)) {
-        out.factor[at] = f64::from(v);
-    }
-    widen(&mut out.target, &raw.target);
-    for (to, from) in out.gain.iter_mut().zip(raw.gain.chunks_exact(row)) {
-        widen(to, from);
-    }
-    widen(out.residual.as_flattened_mut(), &raw.residual);
-    Ok(out)
-}
-
-fn wrong_length(field: &'static str) -> DecodeError {
-    DecodeError::Invalid {
-        field,
-        why: "its length does not fit the number of knots",
-    }
-}
-
-fn widen(to: &mut [f64], from: &[f32]) {
-    for (to, &from) in to.iter_mut().zip(from) {
-        *to = f64::from(from);
-    }
-}
-
 /// The entries of a lower triangle, row by row.
-fn triangle(n: usize) -> impl Iterator<Item = (usize, usize)> {
+pub(super) fn triangle(n: usize) -> impl Iterator<Item = (usize, usize)> {
     (0..n).flat_map(|i| (0..=i).map(move |j| (i, j)))
 }

@@ -1,11 +1,13 @@
 //! What a skill is: a motion to play, a predictor to mirror with, and where both came from.
 
 mod bytes;
+mod confidence;
 #[cfg(any(test, feature = "testing"))]
 mod example;
 mod file;
 pub(crate) mod gmm;
 mod gmr;
+mod predictor;
 mod task;
 mod turn;
 
@@ -18,11 +20,12 @@ use sha2::{Digest, Sha256};
 use crate::predict::{Model, ModelError, TurnModel};
 use crate::wire::codec::DecodeError;
 
+pub use confidence::{chi_squared_cdf, chi_squared_quantile};
 #[cfg(any(test, feature = "testing"))]
 pub use example::{example, posed_example};
 pub use file::FileError;
 pub use gmm::{Component, Gmm, GmmError, MAX_COMPONENTS};
-pub use gmr::{Gmr, GmrError, Regressed};
+pub use gmr::{Gmr, GmrError, Moving, Regressed};
 pub use task::{MAX_FRAMES, Placement, TaskError, TaskFrame, TaskModel};
 pub use turn::{RegressedTurn, TurnError, TurnMixture};
 
@@ -77,6 +80,17 @@ pub struct Pace {
     pub mean_ln_s: f64,
     /// Its standard deviation, > 0.
     pub deviation_ln: f64,
+}
+
+impl Pace {
+    /// The duration that a share `p` of performances stays below, s: its median at 0.5. `None` unless
+    /// 0 < p < 1.
+    pub fn quantile_s(&self, p: f64) -> Option<f64> {
+        // A squared standard normal has one degree of freedom.
+        let z = chi_squared_quantile((2.0 * p - 1.0).abs(), 1)?.sqrt();
+        let z = if p < 0.5 { -z } else { z };
+        Some(libm::exp(self.mean_ln_s + z * self.deviation_ln))
+    }
 }
 
 /// How much a skill has seen, so that a further demonstration weighs what it should.
@@ -201,7 +215,7 @@ pub struct Parts {
 }
 
 /// A learned skill. It exists only in the form its encoding gives it: a predictor's numbers are
-/// rounded to `f32` on construction, so that whoever learned it runs what everybody else runs.
+/// rounded on construction as they travel, so that whoever learned it runs what everybody else runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Skill {
     parts: Parts,

@@ -6,6 +6,7 @@ use nalgebra::{Matrix3, SVector, UnitQuaternion, Vector3};
 
 use super::gmr::{Gmr, GmrError, Regressed};
 use super::{Gmm, MAX_NAME_BYTES};
+use crate::pose;
 
 /// The most frames a motion may be relative to.
 pub const MAX_FRAMES: usize = 8;
@@ -117,31 +118,71 @@ impl TaskModel {
     /// # Errors
     /// [`TaskError::Placements`].
     pub fn at(&self, t_s: f64, placements: &[Placement]) -> Result<Regressed<3>, TaskError> {
+        let mut precision = Matrix3::zeros();
+        let mut pull = Vector3::zeros();
+        let mut about = None;
+        self.says(t_s, placements, |placement, sure, mean| {
+            // Positions are taken about one of the origins: a frame far from the tracker's origin loses no digits.
+            let about = *about.get_or_insert(placement.origin);
+            precision += sure;
+            pull += sure * (mean + (placement.origin - about));
+        })?;
+        let covariance = precision.try_inverse().unwrap_or_else(Matrix3::zeros);
+        Ok(Regressed {
+            mean: about.unwrap_or_else(|| placements[0].origin) + covariance * pull,
+            covariance: (covariance + covariance.transpose()) * 0.5,
+        })
+    }
+
+    /// How the hand is turned at `t_s`, in the world, beyond what was demonstrated, with the frames placed so.
+    ///
+    /// Each frame asks for what turns its usual axes into those placed. They are heard in proportion to their
+    /// say on the place then, `tr(Λ⁻¹Λ_f)/3`: at the end of a motion towards a goal that is turned, the hand
+    /// is turned with it, at the start it is not. No allocation.
+    ///
+    /// # Errors
+    /// [`TaskError::Placements`].
+    pub fn turned_at(
+        &self,
+        t_s: f64,
+        placements: &[Placement],
+    ) -> Result<UnitQuaternion<f64>, TaskError> {
+        let mut precision = Matrix3::zeros();
+        self.says(t_s, placements, |_, sure, _| precision += sure)?;
+        let all = precision.try_inverse().unwrap_or_else(Matrix3::zeros);
+        let mut asked = [(0.0, UnitQuaternion::identity()); MAX_FRAMES];
+        let mut frames = self.frames.iter().zip(&mut asked);
+        self.says(t_s, placements, |placement, sure, _| {
+            if let Some((frame, asked)) = frames.next() {
+                let share = (all * sure).trace().max(0.0);
+                *asked = (share, placement.turn * frame.usual.turn.inverse());
+            }
+        })?;
+        Ok(pose::mean(asked.into_iter()).unwrap_or_else(UnitQuaternion::identity))
+    }
+
+    /// Calls `each(placement, precision, mean)` for every frame, in order: what it says in the world's axes,
+    /// the mean relative to its origin. A frame whose covariance cannot be inverted has nothing to say: precision 0.
+    fn says(
+        &self,
+        t_s: f64,
+        placements: &[Placement],
+        mut each: impl FnMut(&Placement, Matrix3<f64>, Vector3<f64>),
+    ) -> Result<(), TaskError> {
         if placements.len() != self.frames.len() {
             return Err(TaskError::Placements {
                 found: placements.len(),
                 expected: self.frames.len(),
             });
         }
-        let mut precision = Matrix3::zeros();
-        let mut pull = Vector3::zeros();
-        // Positions are taken about one of the origins: a frame far from the tracker's origin loses no digits.
-        let about = placements[0].origin;
         for (gmr, placement) in self.regressions.iter().zip(placements) {
             let local = gmr.query(&SVector::from([t_s]));
             let axes = placement.turn.to_rotation_matrix().into_inner();
             let covariance = axes * local.covariance * axes.transpose();
-            let Some(sure) = covariance.try_inverse() else {
-                continue;
-            };
-            precision += sure;
-            pull += sure * (axes * local.mean + (placement.origin - about));
+            let sure = covariance.try_inverse().unwrap_or_else(Matrix3::zeros);
+            each(placement, sure, axes * local.mean);
         }
-        let covariance = precision.try_inverse().unwrap_or_else(Matrix3::zeros);
-        Ok(Regressed {
-            mean: about + covariance * pull,
-            covariance: (covariance + covariance.transpose()) * 0.5,
-        })
+        Ok(())
     }
 }
 
@@ -215,6 +256,20 @@ mod tests {
             let axes = turn.to_rotation_matrix().into_inner();
             assert!((axes * a.covariance * axes.transpose() - b.covariance).norm() < 1e-9);
         }
+    }
+
+    #[test]
+    fn the_hand_turns_with_the_frame_it_is_near() {
+        let task = TaskModel::new(vec![frame("start", 0.0), frame("goal", 1.0)]).unwrap();
+        let mut placed = [at([0.0; 3]), at([1.0, -1.0, 0.5])];
+        let none = task.turned_at(0.5, &placed).unwrap();
+        assert!(none.angle() < 1e-9);
+        placed[1].turn = UnitQuaternion::from_euler_angles(0.0, 0.0, 0.8);
+        let turned = |t_s| task.turned_at(t_s, &placed).unwrap();
+        assert!(turned(0.0).angle() < 1e-3);
+        assert!(turned(1.0).angle_to(&placed[1].turn) < 1e-3);
+        let half = turned(0.5);
+        assert!((half.angle() - 0.4).abs() < 1e-6, "{}", half.angle());
     }
 
     #[test]

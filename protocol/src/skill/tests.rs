@@ -1,9 +1,12 @@
-use nalgebra::{SMatrix, SVector};
+use nalgebra::{SMatrix, SVector, UnitQuaternion};
 use proptest::prelude::*;
 
 use super::example::{example, example_model, posed_example};
 use super::*;
-use crate::predict::{Calibration, Regression, Standardisation};
+use crate::predict::{
+    Calibration, HandState, Params, Regression, Standardisation, TurnState, checksum,
+};
+use crate::time::Stamp;
 
 #[test]
 fn a_skill_is_what_its_bytes_say() {
@@ -172,6 +175,37 @@ fn a_model_with_a_bad_number_is_refused() {
     ));
 }
 
+/// A step is two hundredths of what remains unexplained at most: predictions change by no more than that.
+#[test]
+fn rounding_a_predictor_costs_it_nothing() {
+    let raw = example_model(14, 24);
+    let parts = Parts {
+        predictor: raw.clone(),
+        ..example(14, 24).parts().clone()
+    };
+    let skill = Skill::new(parts).unwrap();
+    assert!(
+        skill.to_bytes().len() < 40_000,
+        "{} B",
+        skill.to_bytes().len()
+    );
+    let mut state = HandState::first(Stamp(0), Vector3::new(0.1, 0.2, 0.3));
+    for i in 1..60 {
+        let u = f64::from(i);
+        let x = Vector3::new(libm::sin(0.3 * u), libm::cos(0.2 * u), 0.01 * u);
+        state.advance(Stamp(i64::from(i) * 31_000_000), x);
+        let (a, b) = (raw.posterior(&state), skill.predictor().posterior(&state));
+        for j in 0..24 {
+            let off = (a.displacement[j] - b.displacement[j]).norm();
+            let sigma = a.covariance[j].trace().sqrt();
+            // The steps are per standardised feature: a strange state is a multiple of them off.
+            let strange = 1.0 + a.novelty.sqrt();
+            assert!(off < 0.02 * sigma * strange, "{off} of {sigma} at knot {j}");
+        }
+        assert!((a.novelty / b.novelty - 1.0).abs() < 0.02);
+    }
+}
+
 proptest! {
     #[test]
     fn damaged_bytes_never_panic(at in 0_usize..4096, value: u8, cut in 0_usize..4096) {
@@ -182,6 +216,43 @@ proptest! {
             prop_assert_eq!(skill.to_bytes(), &bytes[..]);
         }
         prop_assert!(Skill::from_bytes(&bytes[..cut % n]).is_err());
+    }
+}
+
+proptest! {
+    /// Whatever a damaged skill still says, both ends can run it.
+    #[test]
+    fn a_damaged_posed_skill_is_refused_or_runs(
+        damage in prop::collection::vec((0_usize..65_536, any::<u8>()), 1..4),
+    ) {
+        let mut bytes = posed_example(3, 4).to_bytes().to_vec();
+        let n = bytes.len();
+        for (at, value) in damage {
+            bytes[at % n] = value;
+        }
+        let Ok(skill) = Skill::from_bytes(&bytes) else {
+            return Ok(());
+        };
+        prop_assert_eq!(skill.to_bytes(), &bytes[..]);
+        let mut state = HandState::first(Stamp(0), Vector3::new(0.1, 0.2, 2.0));
+        state.advance(Stamp(40_000_000), Vector3::new(0.2, 0.2, 1.9));
+        let place = skill.predictor().forecast(&state, &Params::DEFAULT);
+        prop_assert!(place.at(0.1).position.iter().all(|v| v.is_finite()));
+        let turn = skill.turn().map(|turn| {
+            let mut state = TurnState::first(Stamp(0), UnitQuaternion::identity());
+            state.advance(Stamp(40_000_000), UnitQuaternion::from_euler_angles(0.1, 0.2, 0.3));
+            turn.motion.query(0.3);
+            turn.predictor.forecast(&state, &Params::DEFAULT)
+        });
+        if let Some(turn) = &turn {
+            prop_assert!(turn.at(0.1).orientation.coords.iter().all(|v| v.is_finite()));
+        }
+        checksum(&place, turn.as_ref());
+        if let Some(task) = skill.task() {
+            let usual: Vec<_> = task.frames().iter().map(|f| f.usual).collect();
+            task.at(0.5, &usual).unwrap();
+            task.turned_at(0.5, &usual).unwrap();
+        }
     }
 }
 

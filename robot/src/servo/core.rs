@@ -54,7 +54,8 @@ enum Drive {
     Mirror {
         forecast: Forecast,
         valid_at: Mono,
-        turn: Option<TurnForecast>,
+        /// With when it was valid: one that is not renewed goes on from there.
+        turn: Option<(TurnForecast, Mono)>,
         grip: Option<f64>,
     },
     Play(Box<Trajectory>),
@@ -200,7 +201,7 @@ impl Core {
                     *held = forecast;
                     *held_at = valid_at;
                     // One that appears only now has no reference at the engage to be seen from.
-                    *held_turn = held_turn.map(|held| turn.unwrap_or(held));
+                    *held_turn = held_turn.map(|held| turn.map_or(held, |turn| (turn, valid_at)));
                     *held_grip = grip.or(*held_grip);
                     self.safety.news(lease);
                 }
@@ -229,15 +230,15 @@ impl Core {
             } => Drive::Mirror {
                 forecast,
                 valid_at,
-                turn,
+                turn: turn.map(|turn| (turn, valid_at)),
                 grip,
             },
             Source::Play(trajectory) => Drive::Play(trajectory),
         };
         // An orientation that is none would be the reference for all that follows.
         let hand_orientation = match &drive {
-            Drive::Mirror { turn, valid_at, .. } => turn.map(|turn| {
-                let q = turn.at(now.secs_since(*valid_at)).orientation;
+            Drive::Mirror { turn, .. } => turn.map(|(turn, valid_at)| {
+                let q = turn.at(now.secs_since(valid_at)).orientation;
                 q.coords.iter().all(|v| v.is_finite()).then_some(q)
             }),
             Drive::Play(trajectory) => trajectory
@@ -305,10 +306,10 @@ impl Core {
                 turn,
                 grip,
             } => {
-                let horizon_s = now.secs_since(*valid_at) + self.config.lag_s;
+                let horizon_s = |valid_at| now.secs_since(valid_at) + self.config.lag_s;
                 (
-                    forecast.at(horizon_s).position,
-                    turn.map(|turn| Some(turn.at(horizon_s).orientation)),
+                    forecast.at(horizon_s(*valid_at)).position,
+                    turn.map(|(turn, valid_at)| Some(turn.at(horizon_s(valid_at)).orientation)),
                     *grip,
                     ramp(since_s / RAMP_S),
                 )

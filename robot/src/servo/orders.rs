@@ -90,7 +90,7 @@ pub enum Order {
         forecast: Forecast,
         /// When its newest sample was valid.
         valid_at: Mono,
-        /// The hand's orientation; without news of it the last one holds.
+        /// The hand's orientation, valid at the same moment; without news of it the last forecast goes on.
         turn: Option<TurnForecast>,
         /// How far the gripper is to be open, from 0 to 1; without news of it the last one holds.
         grip: Option<f64>,

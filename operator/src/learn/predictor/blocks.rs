@@ -10,13 +10,14 @@ use crate::learn::LearnError;
 use crate::learn::em::{EmOptions, add_outer, mirror};
 
 /// The blocks of one component's scatter that the regression needs.
-struct Blocks {
-    n: f64,
+#[derive(Clone)]
+pub(super) struct Blocks {
+    pub(super) n: f64,
     feature_mean: SVector<f64, FEATURES>,
-    target_mean: [f64; TARGETS],
+    pub(super) target_mean: [f64; TARGETS],
     ff: SMatrix<f64, FEATURES, FEATURES>,
     fy: [[f64; TARGETS]; FEATURES],
-    yy: [[f64; BLOCK]; MAX_KNOTS],
+    pub(super) yy: [[f64; BLOCK]; MAX_KNOTS],
 }
 
 impl Blocks {
@@ -31,7 +32,7 @@ impl Blocks {
         }
     }
 
-    fn of<'a>(rows: &[Row], shares: impl Iterator<Item = &'a f64> + Clone) -> Self {
+    pub(super) fn of<'a>(rows: &[Row], shares: impl Iterator<Item = &'a f64> + Clone) -> Self {
         let mut b = Self::zeros();
         for (row, &r) in rows.iter().zip(shares.clone()) {
             b.n += r;
@@ -62,6 +63,39 @@ impl Blocks {
         b
     }
 
+    /// The scatter of both together (the parallel-axis rule).
+    pub(super) fn join(&mut self, other: &Self) {
+        if other.n <= 0.0 {
+            return;
+        }
+        let n = self.n + other.n;
+        let between = self.n * other.n / n;
+        let f = other.feature_mean - self.feature_mean;
+        let mut y = other.target_mean;
+        y.iter_mut()
+            .zip(&self.target_mean)
+            .for_each(|(y, m)| *y -= m);
+        self.combine(1.0, other, 1.0);
+        self.ff += f * f.transpose() * between;
+        for (fy, f) in self.fy.iter_mut().zip(f.iter()) {
+            fy.iter_mut()
+                .zip(&y)
+                .for_each(|(v, y)| *v += between * f * y);
+        }
+        for (yy, y) in self.yy.iter_mut().zip(y.chunks_exact(3)) {
+            yy.iter_mut()
+                .zip(outer(y, y))
+                .for_each(|(v, o)| *v += between * o);
+        }
+        let share = other.n / n;
+        self.feature_mean += f * share;
+        self.target_mean
+            .iter_mut()
+            .zip(&y)
+            .for_each(|(m, y)| *m += share * y);
+        self.n = n;
+    }
+
     /// self·a + other·c, moments only.
     fn combine(&mut self, a: f64, other: &Self, c: f64) {
         self.ff = self.ff * a + other.ff * c;
@@ -76,9 +110,6 @@ impl Blocks {
 }
 
 /// The last M step, over all knots, and the regressions of it: component `k` sees the rows that `seen(k)` gives.
-///
-/// `C_k = (S_k + ν·T)/(N_k + ν)`; `B = (C_ff + ridge·I)⁻¹ C_fy`;
-/// `V = C_yy − BᵀC_fy − C_yf B + BᵀC_ff B` with the covariances before the ridge.
 pub(super) fn regressions<'a>(
     seen: impl Fn(usize) -> Cow<'a, [Row]>,
     shares: &[f64],
@@ -86,9 +117,21 @@ pub(super) fn regressions<'a>(
     scaling: &Scaling,
     options: &EmOptions,
 ) -> Result<Vec<Regression>, LearnError> {
-    let mut blocks: Vec<Blocks> = (0..stride)
+    let blocks = (0..stride)
         .map(|k| Blocks::of(&seen(k), shares.iter().skip(k).step_by(stride)))
         .collect();
+    of_blocks(blocks, scaling, options)
+}
+
+/// The regressions of scatters.
+///
+/// `C_k = (S_k + ν·T)/(N_k + ν)`; `B = (C_ff + ridge·I)⁻¹ C_fy`;
+/// `V = C_yy − BᵀC_fy − C_yf B + BᵀC_ff B` with the covariances before the ridge.
+pub(super) fn of_blocks(
+    mut blocks: Vec<Blocks>,
+    scaling: &Scaling,
+    options: &EmOptions,
+) -> Result<Vec<Regression>, LearnError> {
     let total: f64 = blocks.iter().map(|b| b.n).sum();
     let mut tied = Blocks::zeros();
     for b in &blocks {
@@ -104,6 +147,67 @@ pub(super) fn regressions<'a>(
             regression(b, weight, scaling, options.ridge)
         })
         .collect()
+}
+
+/// The scatters that [`of_blocks`] made these regressions of, with targets in metres (rad), from `rows` rows: all
+/// that a trained predictor still knows of its data.
+///
+/// `C_ff = LLᵀ − ridge·I`, `C_fy = LLᵀB`, `C_yy = V + BᵀC_fy + C_yf B − BᵀC_ff B`; with
+/// `M_k = (N_k + ν)·C_k` the pooled covariance is `T = Σ M_k/(N + Kν)`, and `S_k = M_k − ν·T`.
+pub(super) fn recovered(regressions: &[Regression], rows: f64, options: &EmOptions) -> Vec<Blocks> {
+    let k = regressions.len() as f64;
+    let weights = rows + k * options.weight_prior;
+    let mut blocks: Vec<Blocks> = regressions
+        .iter()
+        .map(|r| {
+            let n = (r.weight * weights - options.weight_prior).max(0.0);
+            let mut c = covariance(r, options.ridge);
+            c.n = n;
+            let zeros = Blocks::zeros();
+            c.combine(n + options.shrinkage, &zeros, 0.0);
+            c
+        })
+        .collect();
+    let mut tied = Blocks::zeros();
+    for b in &blocks {
+        tied.combine(1.0, b, 1.0 / (rows + k * options.shrinkage));
+    }
+    for b in &mut blocks {
+        b.combine(1.0, &tied, -options.shrinkage);
+        // What the rounding of an encoded skill left of a scatter that was nothing.
+        for yy in &mut b.yy {
+            for d in [0, 3, 5] {
+                yy[d] = yy[d].max(0.0);
+            }
+        }
+    }
+    blocks
+}
+
+fn covariance(r: &Regression, ridge: f64) -> Blocks {
+    let mut c = Blocks::zeros();
+    c.feature_mean = r.mean;
+    c.target_mean = r.target;
+    let ridged = r.factor * r.factor.transpose();
+    c.ff = ridged - SMatrix::<f64, FEATURES, FEATURES>::identity() * ridge;
+    let b = SMatrix::<f64, FEATURES, TARGETS>::from_fn(|i, j| r.gain[i][j]);
+    let fy = ridged * b;
+    let ff_b = c.ff * b;
+    for (i, row) in c.fy.iter_mut().enumerate() {
+        for (j, v) in row.iter_mut().enumerate() {
+            *v = fy[(i, j)];
+        }
+    }
+    for (knot, yy) in c.yy.iter_mut().enumerate() {
+        let at = 3 * knot;
+        let (b, fy) = (b.fixed_columns::<3>(at), fy.fixed_columns::<3>(at));
+        let cross = b.transpose() * fy;
+        let explained = b.transpose() * ff_b.fixed_columns::<3>(at) - cross - cross.transpose();
+        for ((yy, v), (i, j)) in yy.iter_mut().zip(&r.residual[knot]).zip(UPPER) {
+            *yy = v - 0.5 * (explained[(i, j)] + explained[(j, i)]);
+        }
+    }
+    c
 }
 
 fn regression(

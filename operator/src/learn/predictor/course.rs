@@ -54,6 +54,9 @@ pub(in crate::learn) trait Course {
     /// The mixture's answer.
     fn posterior(model: &Self::Model, state: &Self::State) -> Posterior;
 
+    /// A model's mixture, and the charts of its components where the space needs them.
+    fn parts(model: &Self::Model) -> (&Model, &[UnitQuaternion<f64>]);
+
     /// The model of these parts.
     fn model(fitted: &Fitted, calibration: Calibration) -> Result<Self::Model, ModelError>;
 }
@@ -104,6 +107,10 @@ impl Course for Places {
 
     fn posterior(model: &Model, state: &HandState) -> Posterior {
         model.posterior(state)
+    }
+
+    fn parts(model: &Model) -> (&Model, &[UnitQuaternion<f64>]) {
+        (model, &[])
     }
 
     fn model(fitted: &Fitted, calibration: Calibration) -> Result<Model, ModelError> {
@@ -186,6 +193,10 @@ impl Course for Turns {
 
     fn posterior(model: &TurnModel, state: &TurnState) -> Posterior {
         model.posterior(state)
+    }
+
+    fn parts(model: &TurnModel) -> (&Model, &[UnitQuaternion<f64>]) {
+        (model.model(), model.charts())
     }
 
     fn model(fitted: &Fitted, calibration: Calibration) -> Result<TurnModel, ModelError> {

@@ -2,6 +2,7 @@
 
 mod blocks;
 mod course;
+mod refine;
 
 use nalgebra::{SVector, UnitQuaternion, Vector3};
 use rand::SeedableRng;
@@ -20,6 +21,7 @@ use super::{LearnError, Progress};
 use crate::demonstration::Demonstration;
 use course::Fitted;
 pub(super) use course::{Course, Places, Turns};
+pub(super) use refine::refine;
 
 /// Dimension of the joint that EM sees: the features and three displacements.
 const JOINT: usize = FEATURES + 9;
@@ -191,15 +193,32 @@ fn rows<C: Course>(demonstrations: &[Demonstration], knots: usize) -> Vec<Vec<Ro
         .collect()
 }
 
+/// How many of a demonstration's samples become rows.
+pub(super) fn row_count(d: &Demonstration) -> usize {
+    let mut last_s = f64::NEG_INFINITY;
+    d.samples()
+        .iter()
+        .filter(|s| kept(s.t_s, &mut last_s))
+        .count()
+}
+
+/// Whether a sample at `t_s` is far enough from the last one kept.
+fn kept(t_s: f64, last_s: &mut f64) -> bool {
+    let far = t_s - *last_s >= LEAST_SPACING_S;
+    if far {
+        *last_s = t_s;
+    }
+    far
+}
+
 fn rows_of<C: Course>(d: &Demonstration, knots: usize, chart: &UnitQuaternion<f64>) -> Vec<Row> {
     let mut last_s = f64::NEG_INFINITY;
     let mut rows = Vec::with_capacity(d.samples().len());
     for (i, state) in C::states(d).iter().enumerate() {
         let t_s = d.samples()[i].t_s;
-        if t_s - last_s < LEAST_SPACING_S {
+        if !kept(t_s, &mut last_s) {
             continue;
         }
-        last_s = t_s;
         let mut targets = [0.0; TARGETS];
         for (j, y) in targets.chunks_exact_mut(3).take(knots).enumerate() {
             y.copy_from_slice(C::displacement(d, i, j + 1).as_slice());
@@ -279,13 +298,7 @@ fn fit<C: Course>(
     let joint: Vec<SVector<f64, JOINT>> = scaled.iter().map(|r| joint(r, options.knots)).collect();
     let em_options = EmOptions {
         components: options.components.min((rows.len() / 4).max(1)),
-        max_iterations: options.max_iterations,
-        convergence: Convergence::Relative(1e-4),
-        standardise: false,
-        ridge: options.ridge,
-        shrinkage: options.shrinkage,
-        weight_prior: 1e-3,
-        ..EmOptions::default()
+        ..em_options(options)
     };
     let (shares, stride) = match labels {
         Some(labels) => em::responsibilities(&joint, labels, &em_options)?,
@@ -308,6 +321,19 @@ fn fit<C: Course>(
         components,
         charts,
     })
+}
+
+fn em_options(options: &PredictorOptions) -> EmOptions {
+    EmOptions {
+        components: options.components,
+        max_iterations: options.max_iterations,
+        convergence: Convergence::Relative(1e-4),
+        standardise: false,
+        ridge: options.ridge,
+        shrinkage: options.shrinkage,
+        weight_prior: 1e-3,
+        ..EmOptions::default()
+    }
 }
 
 fn scale_row(r: &Row, scaling: &Scaling) -> Row {

@@ -2,7 +2,7 @@ mod mixtures;
 
 use std::cell::Cell;
 
-use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+use nalgebra::{Matrix3, SMatrix, SVector, UnitQuaternion, Vector3};
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
@@ -463,4 +463,37 @@ fn names_and_counts_that_no_skill_can_have_are_refused() {
         learn("", &demos),
         LearnError::Skill(SkillError::Name { .. })
     ));
+}
+
+#[test]
+fn recordings_that_show_unlike_things_are_refused_with_the_file_and_the_remedy() {
+    let bare = swing("bare", 1, false);
+    let posed = |orientation: bool| {
+        let samples: Vec<_> = swing("posed", 2, false)
+            .samples()
+            .iter()
+            .map(|s| Sample {
+                orientation: orientation.then(UnitQuaternion::identity),
+                grip: (!orientation).then_some(0.5),
+                ..*s
+            })
+            .collect();
+        Demonstration::from_samples("posed", &samples).unwrap()
+    };
+    for (orientation, column) in [(true, "qw,qx,qy,qz"), (false, "grip")] {
+        let both = [posed(orientation), bare.clone()];
+        let refused = learn_skill("mixed", &both, &LearnOptions::default(), |_| ());
+        let Err(LearnError::Mixed { .. }) = refused else {
+            panic!("{refused:?}");
+        };
+        let text = refused.unwrap_err().to_string();
+        assert!(
+            text.contains(column) && text.contains("which posed has"),
+            "{text}"
+        );
+        assert!(
+            text.starts_with(&bare.path().display().to_string()),
+            "{text}"
+        );
+    }
 }

@@ -1,0 +1,264 @@
+//! A further demonstration refines a predictor whose own are no longer at hand.
+
+use nalgebra::{Matrix3, UnitQuaternion, Vector3};
+use telemime_protocol::predict::{Calibration, FEATURES, MAX_KNOTS, Regression, TARGETS};
+
+use super::blocks::{self, Blocks};
+use super::{
+    Course, EM_KNOTS, Fitted, PredictorOptions, Row, Scaling, em_options, rows_of, scale_row,
+};
+use crate::demonstration::Demonstration;
+use crate::learn::LearnError;
+use crate::learn::trial::Trial;
+
+/// EM steps over the new rows; what the old ones belong to is settled.
+const STEPS: usize = 4;
+
+/// One trial changes a calibrated factor at most this much before it is blended.
+const MOST_CHANGE: f64 = 4.0;
+
+/// A refined predictor.
+pub(in crate::learn) struct Refined<M> {
+    pub(in crate::learn) model: M,
+    /// Rows it has learned from the new demonstration.
+    pub(in crate::learn) rows: usize,
+    /// Share of the new demonstration's samples that were newer to the old model than 90 % of those held out before.
+    pub(in crate::learn) novel: f64,
+}
+
+/// Refines a model that stands for `demonstrations` of together `rows` rows.
+///
+/// Its components give back the scatters they were made of ([`blocks::recovered`]); EM over the new rows adds theirs.
+/// The old model has not seen the new demonstration, so that its errors there are as good as a fold of the
+/// calibration, and count as one of `demonstrations + 1`.
+pub(in crate::learn) fn refine<C: Course>(
+    model: &C::Model,
+    rows: f64,
+    demonstrations: usize,
+    d: &Demonstration,
+) -> Result<Refined<C::Model>, LearnError> {
+    let options = em_options(&PredictorOptions::default());
+    let (inner, charts) = C::parts(model);
+    let features = inner.standardisation().clone();
+    let scaling = Scaling {
+        features: features.clone(),
+        target_mean: [0.0; TARGETS],
+        target_scale: [1.0; TARGETS],
+    };
+    let new: Vec<Row> = rows_of::<C>(d, inner.knots(), &UnitQuaternion::identity())
+        .iter()
+        .map(|row| scale_row(row, &scaling))
+        .collect();
+    let seen = |k: usize| C::seen(&new, charts.get(k), features.scale[0]);
+    let old = blocks::recovered(inner.components(), rows, &options);
+    let knots = EM_KNOTS.map(|knot| knot.min(inner.knots()) - 1);
+    let floor = knots.map(|knot| options.ridge * variance(&old, knot));
+    let mut components = inner.components().to_vec();
+    for _ in 0..STEPS {
+        let stride = components.len();
+        let mut shares = vec![0.0; new.len() * stride];
+        for (k, c) in components.iter().enumerate() {
+            let to = shares.iter_mut().skip(k).step_by(stride);
+            for (share, row) in to.zip(seen(k).iter()) {
+                *share = log_density(c, row, &knots, &floor);
+            }
+        }
+        shares.chunks_exact_mut(stride).for_each(normalise);
+        let mut joined = old.clone();
+        for (k, b) in joined.iter_mut().enumerate() {
+            b.join(&Blocks::of(&seen(k), shares.iter().skip(k).step_by(stride)));
+        }
+        components = blocks::of_blocks(joined, &scaling, &options)?;
+    }
+    let mut trial = Trial::<C>::straight(std::slice::from_ref(d), inner.knots());
+    trial.hold_out(model, d);
+    let novel = trial.beyond(inner.calibration().novelty90);
+    let calibration = blend(inner.calibration(), &trial.calibration(), demonstrations);
+    let fitted = Fitted {
+        knots: inner.knots(),
+        standardisation: features,
+        components,
+        charts: charts.to_vec(),
+    };
+    Ok(Refined {
+        model: C::model(&fitted, calibration)?,
+        rows: new.len(),
+        novel,
+    })
+}
+
+/// Mean variance of the displacement along an axis at a knot (from 0), m² or rad².
+fn variance(blocks: &[Blocks], knot: usize) -> f64 {
+    let n: f64 = blocks.iter().map(|b| b.n).sum();
+    let at = |b: &Blocks| Vector3::from_column_slice(&b.target_mean[3 * knot..3 * knot + 3]);
+    let mean = blocks.iter().map(|b| at(b) * b.n).sum::<Vector3<f64>>() / n;
+    let within = |b: &Blocks| b.yy[knot][0] + b.yy[knot][3] + b.yy[knot][5];
+    let all = |b: &Blocks| within(b) + b.n * (at(b) - mean).norm_squared();
+    blocks.iter().map(all).sum::<f64>() / (3.0 * n) + f64::MIN_POSITIVE
+}
+
+/// ln of a component's weight and density at the features, and of the displacements that follow.
+///
+/// How displacements at different knots vary together is not kept; as they nearly tell the same, the mean of
+/// their log densities stands for them.
+fn log_density(c: &Regression, row: &Row, knots: &[usize; 3], floor: &[f64; 3]) -> f64 {
+    let e = row.features - c.mean;
+    let log_det: f64 = c.factor.diagonal().iter().map(|d| d.ln()).sum();
+    let Some(z) = c.factor.solve_lower_triangular(&e) else {
+        return f64::NEG_INFINITY;
+    };
+    let mut l = c.weight.ln() - log_det - 0.5 * z.norm_squared();
+    for (&knot, &floor) in knots.iter().zip(floor) {
+        let at = 3 * knot;
+        let foretold = |d: usize| {
+            let by_gain: f64 = (0..FEATURES).map(|i| c.gain[i][at + d] * e[i]).sum();
+            row.targets[at + d] - c.target[at + d] - by_gain
+        };
+        let error = Vector3::from_fn(|d, _| foretold(d));
+        let [xx, xy, xz, yy, yz, zz] = c.residual[knot];
+        let v = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz) + Matrix3::identity() * floor;
+        if let Some(v) = v.cholesky() {
+            let half_ln_det: f64 = (0..3).map(|d| v.l_dirty()[(d, d)].ln()).sum();
+            l -= (0.5 * error.dot(&v.solve(&error)) + half_ln_det) / knots.len() as f64;
+        }
+    }
+    if l.is_nan() { f64::NEG_INFINITY } else { l }
+}
+
+fn normalise(l: &mut [f64]) {
+    let max = l.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    if max == f64::NEG_INFINITY {
+        l.fill(1.0 / l.len() as f64);
+        return;
+    }
+    l.iter_mut().for_each(|v| *v = (*v - max).exp());
+    let sum: f64 = l.iter().sum();
+    l.iter_mut().for_each(|v| *v /= sum);
+}
+
+/// What `before` demonstrations have shown and what one more has. After a single one there was nothing to try the
+/// model on: its guesses give way.
+fn blend(old: &Calibration, new: &Calibration, before: usize) -> Calibration {
+    let share = 1.0 / (before + 1) as f64;
+    let tried = if before > 1 { share } else { 1.0 };
+    let factor = |old: f64, new: f64| {
+        if before > 1 {
+            let new = new.clamp(old / MOST_CHANGE, old * MOST_CHANGE);
+            old + (new - old) * tried
+        } else {
+            new
+        }
+    };
+    let mut out = *old;
+    for j in 0..MAX_KNOTS {
+        out.covariance[j] = factor(old.covariance[j], new.covariance[j]);
+        out.straight_m2[j] += (new.straight_m2[j] - old.straight_m2[j]) * share;
+    }
+    out.novelty90 = factor(old.novelty90, new.novelty90);
+    out.params.trust += (new.params.trust - old.params.trust) * tried;
+    out.params.cv_damping += (new.params.cv_damping - old.params.cv_damping) * share;
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use telemime_protocol::predict::Model;
+
+    use super::super::{Places, row_count, train};
+    use super::*;
+    use crate::demonstration::Sample;
+
+    fn trained() -> (Vec<Demonstration>, Model) {
+        let all: Vec<_> = (0..3_u32)
+            .map(|n| {
+                let own = 1.0 + 0.1 * f64::from(n);
+                let samples: Vec<_> = (0..90)
+                    .map(|i| {
+                        let t_s = f64::from(i) / 30.0;
+                        let x = Vector3::new(
+                            (2.0 * own * t_s).sin(),
+                            (3.1 * t_s).cos() * own,
+                            0.2 * (t_s * t_s).sin(),
+                        );
+                        Sample::at(t_s, x * 0.4)
+                    })
+                    .collect();
+                Demonstration::from_samples(format!("{n}"), &samples).unwrap()
+            })
+            .collect();
+        let options = PredictorOptions {
+            components: 5,
+            ..PredictorOptions::default()
+        };
+        let model = train(&all, &options, 0, &mut |_| ()).unwrap();
+        (all, model)
+    }
+
+    /// Ridge and shrinkage are undone and done again.
+    #[test]
+    fn what_regressions_give_back_makes_them_again() {
+        let (all, model) = trained();
+        let rows: usize = all.iter().map(row_count).sum();
+        let options = em_options(&PredictorOptions::default());
+        let back = blocks::recovered(model.components(), rows as f64, &options);
+        let counted: f64 = back.iter().map(|b| b.n).sum();
+        assert!((counted - rows as f64).abs() < 1e-6, "{counted} of {rows}");
+        let scaling = Scaling {
+            features: model.standardisation().clone(),
+            target_mean: [0.0; TARGETS],
+            target_scale: [1.0; TARGETS],
+        };
+        let again = blocks::of_blocks(back, &scaling, &options).unwrap();
+        for (a, b) in model.components().iter().zip(&again) {
+            assert!((a.weight - b.weight).abs() < 1e-12);
+            assert!((a.factor - b.factor).abs().max() < 1e-9);
+            assert!((a.mean - b.mean).norm() < 1e-12);
+            let pairs = a.gain.iter().flatten().zip(b.gain.iter().flatten());
+            assert!(pairs.clone().all(|(a, b)| (a - b).abs() < 1e-9));
+            let pairs = a.residual.iter().flatten().zip(b.residual.iter().flatten());
+            assert!(pairs.clone().all(|(a, b)| (a - b).abs() < 1e-9));
+        }
+    }
+
+    /// Rows that the old mixture assigns as EM did are worth what they would have been in training.
+    #[test]
+    fn blocks_joined_are_blocks_of_both() {
+        let (all, model) = trained();
+        let scaling = Scaling {
+            features: model.standardisation().clone(),
+            target_mean: [0.0; TARGETS],
+            target_scale: [1.0; TARGETS],
+        };
+        let rows: Vec<Row> = rows_of::<Places>(&all[0], 24, &UnitQuaternion::identity())
+            .iter()
+            .map(|row| scale_row(row, &scaling))
+            .collect();
+        let shares: Vec<f64> = (0..rows.len()).map(|i| 0.2 + 0.01 * i as f64).collect();
+        let whole = Blocks::of(&rows, shares.iter());
+        let mut joined = Blocks::of(&rows[..30], shares[..30].iter());
+        joined.join(&Blocks::of(&rows[30..], shares[30..].iter()));
+        assert!((whole.n - joined.n).abs() < 1e-9);
+        for knot in 0..24 {
+            for (a, b) in whole.yy[knot].iter().zip(&joined.yy[knot]) {
+                assert!((a - b).abs() < 1e-9 * whole.n);
+            }
+        }
+        for (a, b) in whole.target_mean.iter().zip(&joined.target_mean) {
+            assert!((a - b).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn the_first_trial_replaces_guesses_and_later_ones_count_alike() {
+        let guess = Calibration::UNTRIED;
+        let mut seen = guess;
+        seen.covariance = [0.5; MAX_KNOTS];
+        seen.novelty90 = 1e6;
+        seen.params.trust = 0.4;
+        assert_eq!(blend(&guess, &seen, 1).covariance[3], 0.5);
+        let later = blend(&guess, &seen, 3);
+        assert!((later.params.trust - (0.75 * guess.params.trust + 0.1)).abs() < 1e-12);
+        // A demonstration of something else does not make everything familiar.
+        assert!(later.novelty90 <= guess.novelty90 * 1.75 + 1e-9);
+    }
+}
