@@ -11,7 +11,7 @@ use telemime_endpoint::cli::{self as shell, one_line};
 use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
 
 use crate::relay::{Passage, Relay, RelayConfig};
-use crate::{demo, ingest, paper, recognise, select, teach};
+use crate::{codec, demo, ingest, paper, recognise, select, teach};
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
 /// network delay behind it.
@@ -44,6 +44,8 @@ enum Command {
     Confusion(recognise::ConfusionArgs),
     /// Compare mixtures for a folder of demonstrations: kinds, numbers of components, criteria.
     Select(select::Args),
+    /// Compress recordings within an error bound, ours beside other ways.
+    Codec(codec::Args),
     /// The operator daemon: teach, drive, play.
     Operator(Box<telemime_operator::cli::Args>),
     /// The robot daemon: an arm that follows.
@@ -115,6 +117,7 @@ pub fn main() -> ExitCode {
         Some(Command::Recognise(args)) => recognise::recognise(args),
         Some(Command::Confusion(args)) => recognise::confusion(args),
         Some(Command::Select(args)) => select::run(args),
+        Some(Command::Codec(args)) => codec::run(args),
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),
         Some(Command::Link(args)) => link(args),

@@ -9,6 +9,7 @@ macro_rules! say {
 }
 
 pub mod cli;
+mod codec;
 mod demo;
 mod figure;
 pub mod ground;

@@ -157,6 +157,7 @@ fn over_time(subject: &Subject, aligned: Option<&Aligned>, d: usize) -> anyhow::
         x_label: "time / s".into(),
         y_label: format!("{} / m", AXES[d]),
         equal_axes: false,
+        doubling: false,
         layers,
     })
 }
@@ -189,6 +190,7 @@ fn plan_view(
         x_label: format!("{} / m", AXES[a]),
         y_label: format!("{} / m", AXES[b]),
         equal_axes: true,
+        doubling: false,
         layers,
     })
 }
@@ -251,6 +253,7 @@ fn before_and_after(subject: &Subject, aligned: &Aligned) -> [Panel; 2] {
             x_label: "share of the performance".into(),
             y_label: format!("{} / m", AXES[d]),
             equal_axes: false,
+            doubling: false,
             layers,
         }
     };
@@ -310,6 +313,7 @@ fn turning(subject: &Subject, aligned: Option<&Aligned>) -> anyhow::Result<Optio
         x_label: "time / s".into(),
         y_label: "rotation vector / °".into(),
         equal_axes: false,
+        doubling: false,
         layers,
     }))
 }
@@ -327,6 +331,7 @@ fn gripping(subject: &Subject) -> anyhow::Result<Option<Panel>> {
         x_label: "time / s".into(),
         y_label: "opening".into(),
         equal_axes: false,
+        doubling: false,
         layers: vec![Layer::new("inferred", BLUE, Shape::Line(mean))],
     }))
 }

@@ -107,6 +107,7 @@ pub(super) fn tube_panel(material: &Material, skill: &Skill, d: usize) -> anyhow
         x_label: "time / s".into(),
         y_label: axis_label(d),
         equal_axes: false,
+        doubling: false,
         layers,
     })
 }
@@ -142,6 +143,7 @@ fn path_panel(run: &Run, verdict: &Verdict, (a, b): (usize, usize)) -> Panel {
         x_label: axis_label(a),
         y_label: axis_label(b),
         equal_axes: true,
+        doubling: false,
         layers: vec![
             Layer::new(
                 format!("± {:.0} mm promised", bound_m * 1e3),
@@ -170,6 +172,7 @@ pub(super) fn mirror(
         x_label: "time / s".into(),
         y_label: axis_label(d),
         equal_axes: false,
+        doubling: false,
         layers: vec![
             Layer::new(
                 "delayed",
@@ -200,6 +203,7 @@ pub(super) fn mirror(
         x_label: "time / s".into(),
         y_label: "distance / m".into(),
         equal_axes: false,
+        doubling: false,
         layers: vec![
             Layer::new(
                 "delayed",

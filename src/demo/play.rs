@@ -88,6 +88,7 @@ pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Res
         x_label: "time / s".into(),
         y_label: format!("{} / m", AXES[d]),
         equal_axes: false,
+        doubling: false,
         layers: vec![
             Layer::new(
                 "rebuilt from the checkpoints",
@@ -111,6 +112,7 @@ pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Res
         x_label: "time / s".into(),
         y_label: "distance / mm".into(),
         equal_axes: false,
+        doubling: false,
         layers: vec![Layer::new("", VERMILLION, Shape::Line(error.collect()))],
     };
     let figure = Figure {

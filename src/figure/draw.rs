@@ -163,8 +163,8 @@ where
         .axis_style(AXIS.stroke_width(px(1.0) as u32))
         .x_labels(7)
         .y_labels(6)
-        .x_label_formatter(&|v| number(*v, x_decimals))
-        .y_label_formatter(&|v| number(*v, y_decimals))
+        .x_label_formatter(&|v| tick(*v, x_decimals, panel.doubling))
+        .y_label_formatter(&|v| tick(*v, y_decimals, panel.doubling))
         .label_style(text(TICK * k, SOFT_INK))
         .axis_desc_style(text(LABEL * k, INK))
         .x_desc(&panel.x_label)
@@ -375,6 +375,18 @@ fn stroke(layer: &Layer, k: f64) -> ShapeStyle {
 
 fn text(size: f64, colour: RGBColor) -> TextStyle<'static> {
     (FONT, size).into_font().color(&colour)
+}
+
+/// On a doubling scale, powers of two where there is one; else the number.
+fn tick(v: f64, decimals: usize, doubling: bool) -> String {
+    if !doubling {
+        return number(v, decimals);
+    }
+    if (v - v.round()).abs() > 1e-9 {
+        return String::new();
+    }
+    let decimals = (-v.round()).max(0.0) as usize;
+    number(v.round().exp2(), decimals)
 }
 
 fn number(v: f64, decimals: usize) -> String {

@@ -35,6 +35,8 @@ pub(crate) struct Panel {
     pub(crate) y_label: String,
     /// A metre across is as long as a metre upwards: for paths.
     pub(crate) equal_axes: bool,
+    /// Both coordinates are logarithms to base 2; the axes show what they are of.
+    pub(crate) doubling: bool,
     /// What is drawn.
     pub(crate) layers: Vec<Layer>,
 }
@@ -150,6 +152,7 @@ mod tests {
             x_label: "time / s".into(),
             y_label: "x / m".into(),
             equal_axes,
+            doubling: false,
             layers: vec![
                 Layer::new("within 5 cm", SKY, first),
                 Layer::new("hand", BLACK, Shape::Line(wave.clone())),

@@ -64,6 +64,7 @@ fn panel(raw: &Path, imported: &Imported) -> Panel {
         x_label: "time / s".into(),
         y_label: "speed / (m/s)".into(),
         equal_axes: false,
+        doubling: false,
         layers,
     }
 }

@@ -67,6 +67,7 @@ fn row(task: &Shown) -> [Panel; 3] {
         x_label: x_label.into(),
         y_label: y_label.into(),
         equal_axes: false,
+        doubling: false,
         layers,
     };
     let mut in_time = curves(&|x| over(x, 1));

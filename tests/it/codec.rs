@@ -1,6 +1,7 @@
 //! The codecs on real recordings.
 
 use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
 
 use crate::data::needs;
 use nalgebra::Vector3;
@@ -110,5 +111,114 @@ fn a_plan_holds_its_bound_on_real_motions() {
         }
         println!("{set} at {bound_m} m: {points} checkpoints of {samples} samples");
         assert!((points as f64) < most * samples as f64);
+    }
+}
+
+fn codec(args: &[&str]) -> Output {
+    let telemime = Command::new(env!("CARGO_BIN_EXE_telemime"))
+        .arg("codec")
+        .args(args)
+        .output();
+    telemime.expect("telemime runs")
+}
+
+fn refusal(args: &[&str]) -> String {
+    let out = codec(args);
+    assert_eq!(out.status.code(), Some(1), "{args:?}");
+    let text = String::from_utf8(out.stderr).expect("text");
+    assert_eq!(text.trim_end().lines().count(), 1, "{text}");
+    text
+}
+
+fn csv(rows: impl IntoIterator<Item = [f64; 4]>) -> String {
+    let rows = rows
+        .into_iter()
+        .map(|[t, x, y, z]| format!("{t},{x},{y},{z}\n"));
+    "t,x,y,z\n".to_owned() + &rows.collect::<String>()
+}
+
+/// Bounds and recordings that make no sense are refused in one line; a hand at rest is a motion of two points.
+#[test]
+fn the_command_refuses_nonsense_and_takes_rest() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let write = |name: &str, text: String| {
+        let path = dir.path().join(name);
+        std::fs::write(&path, text).expect("a file");
+        path.to_str().expect("a name").to_owned()
+    };
+    let row = |i: u32| [f64::from(i) * 0.02, 0.1 * f64::from(i % 7), 0.0, 1.0];
+    let good = write("good.csv", csv((0..50).map(row)));
+    let rest = write(
+        "rest.csv",
+        csv((0..50).map(|i| [row(i)[0], 0.3, -0.2, 1.0])),
+    );
+    let one = write("one.csv", csv((0..1).map(row)));
+    let back = write("back.csv", csv((0..50).rev().map(row)));
+    let nan = write(
+        "nan.csv",
+        csv((0..50).map(|i| [row(i)[0], f64::NAN, 0.0, 0.0])),
+    );
+    assert!(refusal(&[&good, "--bound", "0"]).contains("--bound"));
+    assert!(refusal(&[&good, "--bound", "NaN"]).contains("--bound"));
+    assert!(refusal(&[&good, "--bound", "1e-9"]).contains("below the quantiser"));
+    assert!(refusal(&[&good, "--turn-bound", "2"]).contains("--turn-bound"));
+    assert!(refusal(&[&good, "--points", "1"]).contains("at least 2"));
+    assert!(refusal(&[&one]).contains("one.csv"));
+    assert!(refusal(&[&back]).contains("back.csv"));
+    assert!(refusal(&[&nan]).contains("nan.csv"));
+    assert!(refusal(&["nowhere.csv"]).contains("nowhere.csv"));
+
+    let out = codec(&[&rest, "--json"]);
+    assert!(out.status.success());
+    let study: serde_json::Value = serde_json::from_slice(&out.stdout).expect("one JSON object");
+    let ours = &study["same_error"][0];
+    assert_eq!(
+        (&ours["coder"], &ours["points"]),
+        (&"batch".into(), &2.into())
+    );
+    assert_eq!(ours["r_squared"], serde_json::json!([null, null, null]));
+    assert!(study["orientation"].is_null());
+}
+
+/// At equal largest error; the figures of all recordings are in docs/codec.md.
+#[test]
+fn ours_takes_fewer_bytes_than_the_deadbands() {
+    for (set, bound, bits, whole) in [
+        ("utd_mhad/a03_wave", "0.02", 1.15, 1.6),
+        ("robottasks/pouring", "0.001", 1.9, 3.5),
+        ("vr_hvr_ik/free_arm", "0.01", 1.5, 2.5),
+    ] {
+        let Some(dir) = folder(set) else { continue };
+        let mut files: Vec<_> = std::fs::read_dir(dir)
+            .expect("the folder")
+            .map(|e| e.expect("an entry").path().display().to_string())
+            .collect();
+        files.sort();
+        let mut args: Vec<&str> = files.iter().take(3).map(String::as_str).collect();
+        args.extend(["--bound", bound, "--json"]);
+        let out = codec(&args);
+        assert!(out.status.success());
+        let study: serde_json::Value = serde_json::from_slice(&out.stdout).expect("JSON");
+        let rows = study["same_error"].as_array().expect("rows");
+        let of = |coder: &str, what: &str| {
+            let row = rows.iter().find(|r| r["coder"] == coder).expect(coder);
+            assert!(
+                row["largest_error_m"].as_f64() <= bound.parse().ok(),
+                "{row}"
+            );
+            row[what].as_f64().expect(what)
+        };
+        let ratio = |what| of("deadband-linear", what) / of("batch", what);
+        println!(
+            "{set}: {:.2}, {:.2} in whole bytes",
+            ratio("bytes"),
+            ratio("whole_bytes")
+        );
+        assert!(
+            ratio("bytes") > bits && ratio("whole_bytes") > whole,
+            "{set}"
+        );
+        let raw = study["raw_bytes"].as_f64().expect("a number") / of("live", "bytes");
+        assert!(raw > 3.5, "{set}: live {raw}");
     }
 }

@@ -5,6 +5,8 @@
 //! still *happening* (mirror): knots appended one by one to a C¹ curve. In both the promise is checked
 //! on what the receiver decodes, after quantisation.
 
+mod bits;
+mod packed;
 pub mod path;
 mod plan;
 mod pose;
@@ -108,6 +110,12 @@ pub enum CheckpointError {
         /// Step of the times, µs.
         tick_us: u32,
     },
+    /// The bits end before the plan does, or hold a number that is none.
+    #[error("the plan's bits end too soon")]
+    Truncated,
+    /// Bits are left over after the plan.
+    #[error("bits are left over after the plan")]
+    Trailing,
     /// The points have no interpolating spline.
     #[error("no curve through the points: {0}")]
     Spline(#[from] SplineError),

@@ -3,14 +3,14 @@
 use nalgebra::SVector;
 use serde::{Deserialize, Serialize};
 
-use super::{Checkpoint, CheckpointError};
+use super::{Checkpoint, CheckpointError, packed};
 use crate::spline::{BSpline, End};
 
 /// The most checkpoints one plan holds.
 pub const MAX_POINTS: usize = 4096;
 
 /// Coordinates stay within ± this many steps, so that a difference of two fits an `i32`.
-const MAX_STEPS: i32 = 1 << 30;
+pub(super) const MAX_STEPS: i32 = 1 << 30;
 /// The coarsest time grid, µs.
 const MAX_TICK_US: u32 = 1_000_000;
 
@@ -22,6 +22,27 @@ pub struct Grid {
 }
 
 impl Grid {
+    /// The grid of these steps (nm, or 10⁻⁹) and ticks (µs).
+    ///
+    /// # Errors
+    /// [`CheckpointError::Grid`]: a step of zero, a tick of zero or more than a second.
+    pub fn new(step_nm: u32, tick_us: u32) -> Result<Self, CheckpointError> {
+        if step_nm == 0 || !(1..=MAX_TICK_US).contains(&tick_us) {
+            return Err(CheckpointError::Grid { step_nm, tick_us });
+        }
+        Ok(Self { step_nm, tick_us })
+    }
+
+    /// Step of the positions, nm.
+    pub fn step_nm(self) -> u32 {
+        self.step_nm
+    }
+
+    /// Step of the times, µs.
+    pub fn tick_us(self) -> u32 {
+        self.tick_us
+    }
+
     /// The grid for an error bound: positions in steps of a quarter of it, times in ticks of 1 ms.
     ///
     /// In three dimensions rounding to that step costs at most √3/8 ≈ 0.22 of the bound, which leaves
@@ -52,6 +73,36 @@ impl Grid {
     #[must_use]
     pub fn with_fine_ticks(self) -> Self {
         Self { tick_us: 1, ..self }
+    }
+
+    /// Steps `factor` times as long (at least one, at most the longest there is), to two digits downwards.
+    #[must_use]
+    pub fn coarser(self, factor: f64) -> Self {
+        let step_nm = (f64::from(self.step_nm) * factor.max(1.0) * (1.0 + 1e-9)) as u32;
+        let unit = 10u32.pow(step_nm.ilog10().saturating_sub(1));
+        Self {
+            step_nm: step_nm / unit * unit,
+            ..self
+        }
+    }
+
+    /// Ticks of the interval of even samples at `t` (s); the ticks there were, if they are not even.
+    #[must_use]
+    pub fn with_ticks_of(self, t: &[f64]) -> Self {
+        let (Some(first), Some(last)) = (t.first(), t.last()) else {
+            return self;
+        };
+        let tick_us = ((last - first) / (t.len().max(2) - 1) as f64 * 1e6).round();
+        let on_tick = |t: &f64| {
+            let ticks = t * 1e6 / tick_us;
+            (ticks - ticks.round()).abs() < 0.02
+        };
+        if (1.0..=f64::from(MAX_TICK_US)).contains(&tick_us) && t.iter().all(on_tick) {
+            let tick_us = tick_us as u32;
+            Self { tick_us, ..self }
+        } else {
+            self
+        }
     }
 
     /// Step of the positions, m.
@@ -140,6 +191,12 @@ impl<const D: usize> Plan<D> {
         self.grid
     }
 
+    /// How many bytes it takes on the wire, its own length among them.
+    pub fn byte_len(&self) -> usize {
+        let bytes = packed::pack(self.grid, &self.points).len();
+        bytes + if bytes < 251 { 1 } else { 3 }
+    }
+
     /// The decoded checkpoints.
     pub fn checkpoints(&self) -> impl ExactSizeIterator<Item = Checkpoint<D>> + '_ {
         let (tick_s, step_m) = (self.grid.tick_s(), self.grid.step_m());
@@ -160,31 +217,13 @@ impl<const D: usize> Plan<D> {
     }
 }
 
-/// A plan as bytes see it: the first differences, dimension by dimension within a point.
+/// A plan as bytes see it.
 #[derive(Serialize, Deserialize)]
-struct PlanWire {
-    step_nm: u32,
-    tick_us: u32,
-    dt: Vec<u32>,
-    dx: Vec<i32>,
-}
+struct PlanWire(Vec<u8>);
 
 impl<const D: usize> From<Plan<D>> for PlanWire {
     fn from(plan: Plan<D>) -> Self {
-        let (mut t, mut x) = (0, [0; D]);
-        let mut dt = Vec::with_capacity(plan.len());
-        let mut dx = Vec::with_capacity(plan.len() * D);
-        for (ticks, steps) in plan.points {
-            dt.push(ticks - t);
-            dx.extend(steps.iter().zip(x).map(|(now, before)| now - before));
-            (t, x) = (ticks, steps);
-        }
-        Self {
-            step_nm: plan.grid.step_nm,
-            tick_us: plan.grid.tick_us,
-            dt,
-            dx,
-        }
+        Self(packed::pack(plan.grid, &plan.points))
     }
 }
 
@@ -192,38 +231,8 @@ impl<const D: usize> TryFrom<PlanWire> for Plan<D> {
     type Error = CheckpointError;
 
     fn try_from(wire: PlanWire) -> Result<Self, CheckpointError> {
-        let PlanWire {
-            step_nm,
-            tick_us,
-            dt,
-            dx,
-        } = wire;
-        if step_nm == 0 || !(1..=MAX_TICK_US).contains(&tick_us) {
-            return Err(CheckpointError::Grid { step_nm, tick_us });
-        }
-        if dt.len() > MAX_POINTS {
-            return Err(CheckpointError::TooMany);
-        }
-        if dx.len() != dt.len() * D {
-            return Err(CheckpointError::CountMismatch {
-                times: dt.len(),
-                positions: dx.len() / D.max(1),
-            });
-        }
-        let (mut t, mut x) = (0u32, [0i32; D]);
-        let mut points = Vec::with_capacity(dt.len());
-        for (index, (dt, dx)) in dt.iter().zip(dx.chunks_exact(D)).enumerate() {
-            let out_of_range = CheckpointError::OutOfRange { index };
-            t = t.checked_add(*dt).ok_or(out_of_range.clone())?;
-            for (now, d) in x.iter_mut().zip(dx) {
-                *now = now
-                    .checked_add(*d)
-                    .filter(|n| (-MAX_STEPS..=MAX_STEPS).contains(n))
-                    .ok_or(out_of_range.clone())?;
-            }
-            points.push((t, x));
-        }
-        Self::checked(Grid { step_nm, tick_us }, points)
+        let (grid, points) = packed::unpack(&wire.0)?;
+        Self::checked(grid, points)
     }
 }
 
@@ -250,13 +259,15 @@ mod tests {
     fn the_bytes_are_pinned_and_come_back() {
         let plan = plan();
         let bytes = encode(&plan);
-        // step 10⁶ nm, tick 10³ µs; 3 times; 9 zigzag differences, in steps of 1 mm.
         let golden = [
-            &[252, 64, 66, 15, 0, 251, 232, 3, 3, 0, 250, 150, 9][..],
-            &[200, 0, 251, 87, 2, 100, 100, 0, 100, 79, 251, 208, 7],
+            &[0x14, 0x8e, 0x2d, 0x13, 0xcc, 0x88, 0x01, 0x95, 0xd0, 0x1c][..],
+            &[
+                0x38, 0x0f, 0xcf, 0x27, 0x27, 0x2b, 0xc9, 0x9e, 0x00, 0x7d, 0x10,
+            ],
         ]
         .concat();
         assert_eq!(bytes, golden);
+        assert_eq!(bytes.len(), plan.byte_len());
         assert_eq!(decode::<Plan<3>, 4096>(&bytes), Ok(plan));
     }
 
@@ -267,28 +278,72 @@ mod tests {
         assert_eq!(plan().checkpoints().nth(1).unwrap().t_s, 0.25);
     }
 
+    /// The bytes of a list, as [`PlanWire`].
+    fn refused(bytes: &[u8]) -> String {
+        match decode::<Plan<3>, 65_536>(&encode(&bytes.to_vec())) {
+            Err(DecodeError::Malformed(why)) => why,
+            other => panic!("{other:?}"),
+        }
+    }
+
     #[test]
     fn a_plan_that_breaks_a_rule_is_no_plan() {
-        let refuse = |change: fn(&mut PlanWire)| {
-            let mut wire = PlanWire::from(plan());
-            change(&mut wire);
-            let bytes = encode(&wire);
-            matches!(
-                decode::<Plan<3>, 65_536>(&bytes),
-                Err(DecodeError::Malformed(_))
-            )
+        let packed = |grid, points: &[(u32, [i32; 3])]| packed::pack(grid, points);
+        let grid = Grid::new(1000, 1000).unwrap();
+        let two = [(0, [0; 3]), (5, [1; 3])];
+        assert!(refused(&packed(Grid { step_nm: 0, ..grid }, &two)).contains("grid"));
+        assert!(refused(&packed(Grid { tick_us: 0, ..grid }, &two)).contains("grid"));
+        let slow = Grid {
+            tick_us: 1_000_001,
+            ..grid
         };
-        assert!(refuse(|w| w.step_nm = 0));
-        assert!(refuse(|w| w.tick_us = 0));
-        assert!(refuse(|w| w.dt[1] = 0));
-        assert!(refuse(|w| w.dt[1] = u32::MAX - 1));
-        assert!(refuse(|w| w.dx[4] = i32::MAX));
-        assert!(refuse(|w| w.dx.truncate(8)));
-        assert!(refuse(|w| (w.dt, w.dx) = (vec![0], vec![0; 3])));
-        assert!(refuse(|w| {
-            w.dt = vec![1; MAX_POINTS + 1];
-            w.dx = vec![0; 3 * (MAX_POINTS + 1)];
-        }));
+        assert!(refused(&packed(slow, &two)).contains("grid"));
+        assert!(refused(&packed(grid, &two[..1])).contains("at least 2"));
+        let many: Vec<_> = (0..=MAX_POINTS as u32).map(|t| (t, [0; 3])).collect();
+        assert!(refused(&packed(grid, &many)).contains("more than"));
+        let far = [(0, [0; 3]), (5, [MAX_STEPS + 1, 0, 0])];
+        assert!(refused(&packed(grid, &far)).contains("range"));
+        let mut long = packed(grid, &two);
+        long.push(0);
+        assert!(refused(&long).contains("left over"));
+        long.truncate(long.len() - 2);
+        assert!(refused(&long).contains("too soon"));
+    }
+
+    #[test]
+    fn another_spelling_of_a_plan_is_refused() {
+        // Each column's order sits after the head: try every other value of every bit.
+        let bytes = encode(&plan());
+        let mut same = 0;
+        for bit in 8..bytes.len() * 8 {
+            let mut other = bytes.clone();
+            other[bit / 8] ^= 0x80 >> (bit % 8);
+            if decode::<Plan<3>, 4096>(&other).is_ok_and(|p| p == plan()) {
+                same += 1;
+            }
+        }
+        assert_eq!(same, 0);
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn any_bytes_decode_or_err(bytes: Vec<u8>) {
+            if let Ok(plan) = decode::<Plan<3>, 65_536>(&encode(&bytes)) {
+                proptest::prop_assert_eq!(encode(&plan), encode(&bytes));
+            }
+        }
+
+        #[test]
+        fn any_plan_comes_back(
+            points in proptest::collection::vec((1u32..1 << 18, proptest::array::uniform3(-MAX_STEPS..=MAX_STEPS)), 2..40),
+        ) {
+            let mut t = 0;
+            let points = points.into_iter().map(|(dt, x)| { t += dt; (t - 1, x) }).collect();
+            let plan = Plan::checked(Grid::new(12_345, 33_333).unwrap(), points).unwrap();
+            let bytes = encode(&plan);
+            proptest::prop_assert_eq!(bytes.len(), plan.byte_len());
+            proptest::prop_assert_eq!(decode::<Plan<3>, 65_536>(&bytes), Ok(plan));
+        }
     }
 
     #[test]

@@ -10,8 +10,11 @@ use super::{CheckpointError, Plan, select};
 use crate::pose;
 use crate::spline::BSpline;
 
-/// Checkpoints of an orientation lie this near to the unit sphere.
-const NORM_SLACK: f64 = 0.05;
+/// Checkpoints of an orientation lie this near to the unit sphere: they need not lie on the curve they stand for.
+const NORM_SLACK: f64 = 0.25;
+
+/// Checkpoints of a gripper leave [0, 1] by at most this much; what is read of them is clamped.
+const GRIP_SLACK: f64 = 0.05;
 
 /// The curve between them stays this far from the origin, looked at in so many places a span.
 const LEAST_NORM: f64 = 0.5;
@@ -38,8 +41,8 @@ pub enum PosePlanError {
     /// The orientation's checkpoints have no curve.
     #[error("orientation: {0}")]
     Curve(CheckpointError),
-    /// A gripper's opening outside [0, 1].
-    #[error("gripper checkpoint {index} is not in [0, 1]")]
+    /// A gripper's opening outside [−0.05, 1.05].
+    #[error("gripper checkpoint {index} is not in [-0.05, 1.05]")]
     Grip {
         /// The checkpoint.
         index: usize,
@@ -117,7 +120,7 @@ impl PosePlan {
             }
         }
         for (index, c) in grip.iter().flat_map(Plan::checkpoints).enumerate() {
-            if !(-1e-6..=1.0 + 1e-6).contains(&c.x[0]) {
+            if !(-GRIP_SLACK..=1.0 + GRIP_SLACK).contains(&c.x[0]) {
                 return Err(PosePlanError::Grip { index });
             }
         }

@@ -13,6 +13,9 @@ pub struct HermiteSpan<const D: usize> {
     duration_s: f64,
     start: [SVector<f64, D>; 2],
     end: [SVector<f64, D>; 2],
+    /// x = x0 + h·(v0 u + c2 u² + c3 u³)
+    c2: SVector<f64, D>,
+    c3: SVector<f64, D>,
 }
 
 impl<const D: usize> HermiteSpan<D> {
@@ -23,10 +26,15 @@ impl<const D: usize> HermiteSpan<D> {
         start: [SVector<f64, D>; 2],
         end: [SVector<f64, D>; 2],
     ) -> Option<Self> {
+        let [x0, v0] = start;
+        let [x1, v1] = end;
+        let secant = (x1 - x0) / duration_s;
         (duration_s > 0.0 && duration_s.is_finite()).then_some(Self {
             duration_s,
             start,
             end,
+            c2: secant * 3.0 - v0 * 2.0 - v1,
+            c3: v0 + v1 - secant * 2.0,
         })
     }
 
@@ -37,28 +45,29 @@ impl<const D: usize> HermiteSpan<D> {
 
     /// The motion `s` seconds after the span's start; `None` outside `[0, duration]`.
     pub fn eval(&self, s: f64) -> Option<Jet<D>> {
-        if !(0.0..=self.duration_s).contains(&s) {
-            return None;
-        }
-        let h = self.duration_s;
+        let x = self.position(s)?;
+        let (h, v0, c2, c3) = (self.duration_s, self.start[1], self.c2, self.c3);
         let u = s / h;
-        let [x0, v0] = self.start;
-        let [x1, v1] = self.end;
-        let secant = (x1 - x0) / h;
-        // x = x0 + h·(v0 u + c2 u² + c3 u³)
-        let c2 = secant * 3.0 - v0 * 2.0 - v1;
-        let c3 = v0 + v1 - secant * 2.0;
-        // The end is met exactly, whatever the rounding of the polynomial.
-        let x = if s == h {
-            x1
-        } else {
-            x0 + (v0 + (c2 + c3 * u) * u) * s
-        };
         Some(Jet {
             x,
             v: v0 + (c2 * 2.0 + c3 * (3.0 * u)) * u,
             a: (c2 * 2.0 + c3 * (6.0 * u)) / h,
         })
+    }
+
+    /// The position of [`HermiteSpan::eval`] alone, to the bit.
+    #[inline]
+    pub fn position(&self, s: f64) -> Option<SVector<f64, D>> {
+        if !(0.0..=self.duration_s).contains(&s) {
+            return None;
+        }
+        // The end is met exactly, whatever the rounding of the polynomial.
+        if s == self.duration_s {
+            return Some(self.end[0]);
+        }
+        let u = s / self.duration_s;
+        let [x0, v0] = self.start;
+        Some(x0 + (v0 + (self.c2 + self.c3 * u) * u) * s)
     }
 }
 

@@ -188,6 +188,10 @@ impl PathEncoder {
     ) -> Option<PathKnot> {
         let h = end.t.secs_since(from.t);
         let still = Vector3::zeros();
+        let wished = self.grid.quantise(end.t, &end.x, &wish, false).ok()?;
+        if self.holds(from, &wished, between) {
+            return Some(wished);
+        }
         let knot = self.grid.quantise(end.t, &end.x, &still, false).ok()?;
         let base = self.span(from, &knot)?;
         let (mut num, mut den) = (Vector3::zeros(), 0.0);
@@ -195,11 +199,11 @@ impl PathEncoder {
             let t_s = s.t.secs_since(from.t);
             let u = t_s / h;
             let weight = h * u * u * (u - 1.0);
-            num += (s.x - base.eval(t_s)?.x) * weight;
+            num += (s.x - base.position(t_s)?) * weight;
             den += weight * weight;
         }
         let best = if den > 0.0 { num / den } else { wish };
-        [0.0, 0.25, 0.5, 0.75, 1.0].into_iter().find_map(|share| {
+        [0.25, 0.5, 0.75, 1.0].into_iter().find_map(|share| {
             let tangent = wish + (best - wish) * share;
             let knot = self.grid.quantise(end.t, &end.x, &tangent, false).ok()?;
             self.holds(from, &knot, between).then_some(knot)
@@ -212,10 +216,12 @@ impl PathEncoder {
     }
 
     fn holds(&self, from: &DecodedKnot, knot: &PathKnot, between: &[Sample]) -> bool {
+        let limit = self.bound_m * self.bound_m * (1.0 - 1e-12);
         self.span(from, knot).is_some_and(|span| {
-            between.iter().all(|s| {
-                span.eval(s.t.secs_since(from.t))
-                    .is_some_and(|j| (j.x - s.x).norm() <= self.bound_m)
+            // The newest first: they are the ones a stretched span misses.
+            between.iter().rev().all(|s| {
+                span.position(s.t.secs_since(from.t))
+                    .is_some_and(|x| (x - s.x).norm_squared() <= limit)
             })
         })
     }

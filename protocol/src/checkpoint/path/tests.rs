@@ -143,6 +143,23 @@ fn what_cannot_be_is_refused_and_the_path_goes_on() {
     assert!(PathEncoder::new(0.0).is_err());
 }
 
+/// The delay of the live path: a knot is due with the first sample it does not reach, and stands at the one before.
+#[test]
+fn a_knot_is_one_sample_late_and_no_more() {
+    for rate_hz in [30.0, 1000.0] {
+        let samples = swing(rate_hz, 3.0);
+        let mut encoder = PathEncoder::new(0.002).unwrap();
+        let mut knots = 0;
+        for (i, (t, x)) in samples.iter().enumerate() {
+            if let Some(knot) = encoder.push(*t, *x).unwrap() {
+                assert_eq!(knot.tick, tick_of(samples[i - 1].0));
+                knots += 1;
+            }
+        }
+        assert!(knots > 5, "{rate_hz} Hz");
+    }
+}
+
 #[test]
 fn extreme_stamps_do_not_overflow() {
     let mut e = PathEncoder::new(0.01).unwrap();
@@ -220,5 +237,33 @@ proptest! {
             decoder.append(&k).unwrap();
         }
         prop_assert!(worst(&decoder, &samples) <= 0.01);
+    }
+
+    /// Both codecs are near the samples, so they are near each other.
+    #[test]
+    fn live_and_finished_agree(samples in signal(), bound_m in 1e-3..0.05f64) {
+        let (decoder, _) = run(bound_m, &samples);
+        let first = samples[0].0;
+        let (t, x): (Vec<f64>, Vec<_>) =
+            samples.iter().map(|(t, x)| (on_tick(*t).secs_since(on_tick(first)), *x)).unzip();
+        prop_assume!(t.len() > 1);
+        let plan = crate::checkpoint::select::bounded_with(
+            &t,
+            &x,
+            bound_m,
+            crate::checkpoint::select::Effort::Quick,
+        );
+        // Jumps between samples closer than a tick of the plan.
+        prop_assume!(plan.is_ok());
+        let plan = plan.unwrap();
+        let points: Vec<_> = plan.checkpoints().collect();
+        prop_assert_eq!(&crate::checkpoint::Plan::quantise(plan.grid(), &points).unwrap(), &plan);
+        let curve = plan.spline().unwrap();
+        let (start_s, end_s) = curve.span_s();
+        for ((stamp, _), t) in samples.iter().zip(&t) {
+            let live = decoder.eval(on_tick(*stamp)).unwrap().x;
+            let finished = curve.eval(t.clamp(start_s, end_s)).unwrap().x;
+            prop_assert!((live - finished).norm() <= 2.0 * bound_m + 1e-9);
+        }
     }
 }

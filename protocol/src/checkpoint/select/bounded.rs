@@ -1,301 +1,250 @@
-//! Fewest checkpoints within a given error.
+//! Fewest checkpoints, and bytes, within a given error.
 
 use nalgebra::SVector;
 
-use super::super::{Checkpoint, CheckpointError, Grid, MAX_POINTS, Plan, check_series};
+use super::super::{CheckpointError, Grid, Plan, check_series};
+use super::search::{Motion, Search};
 
-/// Sample evaluations spent on making a sufficient choice smaller: a few tenths of a second.
+/// How long to look.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Effort {
+    /// Checkpoints on the curve, inserted until the bound holds: some passes over the samples.
+    Quick,
+    /// Then fewer, moved, off the curve where that helps, on coarser grids: tenths of a second.
+    Thorough,
+}
+
+/// Sample evaluations spent on making a sufficient choice smaller, on each grid.
 const REFINING_EFFORT: usize = 1 << 22;
 
-/// The choice starts with a curve within this many bounds of the samples. Which start ends with fewer
-/// points depends on the motion, so both are tried.
-const STARTS: [f64; 2] = [1.0, 8.0];
+/// Steps tried, in quarters of the bound: coarser ones take fewer bits, and may take more points.
+const COARSER: [f64; 4] = [1.0, 2.0, 3.0, 4.0];
 
 /// Checkpoints of the motion `y` (m) at times `t` (s from its start, not negative, increasing) whose
 /// decoded curve passes within `bound_m` of *every* sample.
 ///
-/// Starts from equal shares of √|Laplacian| (the curvature), inserts the worst sample until the bound
-/// holds on the decoded, quantised curve, then drops points, and moves the others, as long as it
-/// holds. How it chooses is free; what [`Plan`] decodes to is not.
+/// As [`bounded_with`] [`Effort::Thorough`].
 ///
 /// # Errors
-/// [`CheckpointError`]: an unusable bound or series, more than [`MAX_POINTS`] needed, samples less
-/// than a microsecond apart that differ by more than the bound.
+/// As [`bounded_with`].
 pub fn bounded<const D: usize>(
     t: &[f64],
     y: &[SVector<f64, D>],
     bound_m: f64,
 ) -> Result<Plan<D>, CheckpointError> {
-    let coarse = Grid::for_bound(bound_m)?;
+    bounded_with(t, y, bound_m, Effort::Thorough)
+}
+
+/// Checkpoints of the motion `y` (m) at times `t` (s from its start, not negative, increasing) whose
+/// decoded curve passes within `bound_m` of *every* sample.
+///
+/// Starts from equal shares of √|Laplacian| (the curvature), inserts the worst samples until the bound
+/// holds on the quantised curve, then drops points, moves others, and fits the values, as long as it
+/// holds; last, it is checked on what the plan decodes to. How it chooses is free; what [`Plan`] decodes to
+/// is not.
+///
+/// # Errors
+/// [`CheckpointError`]: an unusable bound or series, more than [`MAX_POINTS`](super::super::MAX_POINTS)
+/// needed, samples less than a microsecond apart that differ by more than the bound.
+pub fn bounded_with<const D: usize>(
+    t: &[f64],
+    y: &[SVector<f64, D>],
+    bound_m: f64,
+    effort: Effort,
+) -> Result<Plan<D>, CheckpointError> {
+    let fine = Grid::for_bound(bound_m)?;
     check_series(t, y)?;
-    let slopes = slopes(t, y);
-    let attempt = |grid, near| {
-        let mut chooser = Chooser {
-            t,
-            y,
-            slopes: &slopes,
-            bound_m,
-            grid,
-            effort: 0,
-        };
-        chooser.choose(near)
-    };
-    let fewest = |grid| {
-        let [sure, bold] = STARTS.map(|near| attempt(grid, near));
-        match (sure, bold) {
-            (Ok(sure), Ok(bold)) if bold.len() < sure.len() => Ok(bold),
-            (Ok(plan), _) | (Err(_), Ok(plan)) => Ok(plan),
-            (Err(e), Err(_)) => Err(e),
+    let motion = Motion::new(t, y);
+    if effort == Effort::Quick {
+        return first_that_holds(fine, |grid| quick(&motion, grid, bound_m));
+    }
+    let mut best: Option<(usize, Plan<D>)> = None;
+    let mut refusal = None;
+    for coarser in COARSER {
+        let grid = fine.coarser(coarser).with_ticks_of(t);
+        match first_that_holds(grid, |grid| thorough(&motion, grid, bound_m)) {
+            Ok(plan) => {
+                let bytes = plan.byte_len();
+                if best.as_ref().is_none_or(|b| bytes < b.0) {
+                    best = Some((bytes, plan));
+                }
+            }
+            Err(e) => refusal = refusal.or(Some(e)),
         }
-    };
-    match fewest(coarse) {
-        // Sample times off the millisecond grid, and a bound tighter than that rounding.
+    }
+    match (best, refusal) {
+        (Some((_, plan)), _) => Ok(plan),
+        (None, Some(e)) => Err(e),
+        (None, None) => unreachable!("there is a grid to try"),
+    }
+}
+
+/// On a grid, or with finer ticks where the samples' times do not suit it.
+fn first_that_holds<const D: usize>(
+    grid: Grid,
+    mut attempt: impl FnMut(Grid) -> Result<Plan<D>, CheckpointError>,
+) -> Result<Plan<D>, CheckpointError> {
+    match attempt(grid) {
         Err(CheckpointError::Unreachable { .. } | CheckpointError::Unordered { .. }) => {
-            fewest(coarse.with_fine_ticks())
+            attempt(grid.with_fine_ticks())
         }
         other => other,
     }
 }
 
-struct Chooser<'a, const D: usize> {
-    t: &'a [f64],
-    y: &'a [SVector<f64, D>],
-    slopes: &'a [SVector<f64, D>],
-    bound_m: f64,
+fn quick<const D: usize>(
+    motion: &Motion<'_, D>,
     grid: Grid,
-    effort: usize,
+    bound_m: f64,
+) -> Result<Plan<D>, CheckpointError> {
+    let mut search = Search::new(motion, grid);
+    let start = search.shares(2);
+    let kept = search.insert(start, search_bound(bound_m))?;
+    verified(search.plan(&kept)?, motion, bound_m)
 }
 
-impl<const D: usize> Chooser<'_, D> {
-    fn choose(&mut self, near: f64) -> Result<Plan<D>, CheckpointError> {
-        let mut kept = self.start(near);
-        loop {
-            let errors = self.errors(&kept)?;
-            let (worst, &error_m) = errors
-                .iter()
-                .enumerate()
-                .max_by(|a, b| a.1.total_cmp(b.1))
-                .expect("a series has samples");
-            if error_m <= self.bound_m {
-                break;
-            }
-            if kept.len() == MAX_POINTS {
-                return Err(CheckpointError::TooMany);
-            }
-            let candidate = (1..self.t.len() - 1)
-                .filter(|&i| errors[i] > self.bound_m && self.may_insert(&kept, i))
-                .max_by(|&a, &b| errors[a].total_cmp(&errors[b]));
-            let Some(i) = candidate else {
-                return Err(CheckpointError::Unreachable {
-                    index: worst,
-                    error_m,
-                });
-            };
-            kept.insert(kept.partition_point(|&k| k < i), i);
-        }
-        self.refine(&mut kept);
-        self.plan(&kept)
+fn thorough<const D: usize>(
+    motion: &Motion<'_, D>,
+    grid: Grid,
+    bound_m: f64,
+) -> Result<Plan<D>, CheckpointError> {
+    let mut search = Search::new(motion, grid);
+    let bound = search_bound(bound_m);
+    let start = search.shares(2);
+    let mut kept = search.insert(start, bound)?;
+    let start = search.shares(kept.len() / 2);
+    if let Ok(other) = search.insert(start, bound)
+        && other.len() < kept.len()
+    {
+        kept = other;
     }
+    search.on_curve(&kept);
+    let mut plan = search.plan(&kept)?;
+    refine(&mut search, &mut kept, bound, |search, kept| {
+        plan = search.plan(kept)?;
+        Ok(())
+    })?;
+    verified(plan, motion, bound_m)
+}
 
-    /// Both ends, and equal shares of ∫√|x''| dt between them: half as many again until the curve
-    /// is within `near` bounds. Greedy insertion goes on from there.
-    fn start(&mut self, near: f64) -> Vec<usize> {
-        let n = self.t.len();
-        let mut share = vec![0.0; n];
-        for i in 1..n {
-            let step_s = self.t[i] - self.t[i - 1];
-            let bend = (self.slopes[i] - self.slopes[i - 1]).norm() / step_s;
-            share[i] = share[i - 1] + bend.sqrt() * step_s;
-        }
-        let mut spans = 1;
-        loop {
-            let kept = self.equal_shares(&share, spans);
-            let close = self.worst(&kept, near * self.bound_m).is_some();
-            if close || 2 * spans >= (MAX_POINTS / 2).min(n - 1) {
-                return kept;
-            }
-            spans += spans.div_ceil(2);
+/// The search computes in another order than the decoder: it aims this much inside the bound.
+fn search_bound(bound_m: f64) -> f64 {
+    bound_m * (1.0 - 1e-7)
+}
+
+/// Drops points while some least-squares values, or others' places, keep the bound.
+fn refine<const D: usize>(
+    search: &mut Search<'_, D>,
+    kept: &mut Vec<usize>,
+    bound: f64,
+    mut accept: impl FnMut(&Search<'_, D>, &[usize]) -> Result<(), CheckpointError>,
+) -> Result<(), CheckpointError> {
+    // First as many as go without moving any.
+    let mut j = 1;
+    while j + 1 < kept.len() && search.effort < REFINING_EFFORT {
+        let dropped = kept.remove(j);
+        if search.fit(kept, bound, bound) <= bound {
+            accept(search, kept)?;
+        } else {
+            kept.insert(j, dropped);
+            j += 1;
         }
     }
-
-    fn equal_shares(&self, share: &[f64], spans: usize) -> Vec<usize> {
-        let last = share.len() - 1;
-        let mut kept = vec![0];
-        for s in 1..spans {
-            let goal = share[last] * s as f64 / spans as f64;
-            let i = share.partition_point(|&v| v < goal).min(last);
-            if i < last && self.may_insert(&kept, i) {
-                kept.push(i);
+    // Then the one whose loss costs least, the others moved to make up for it.
+    while kept.len() > 2 && search.effort < REFINING_EFFORT {
+        let mut costs: Vec<(f64, usize)> = Vec::new();
+        for j in 1..kept.len() - 1 {
+            if search.effort >= REFINING_EFFORT {
+                return Ok(());
             }
-        }
-        if kept.len() > 1 && !self.apart(kept[kept.len() - 1], last) {
-            kept.pop();
-        }
-        kept.push(last);
-        kept
-    }
-
-    fn refine(&mut self, kept: &mut Vec<usize>) {
-        // Looking for the best point to drop costs a pass for each point dropped; where that is too
-        // much, drop what can be dropped in one pass.
-        if kept.len() * kept.len() * self.t.len() > REFINING_EFFORT {
-            self.thin(kept);
-        }
-        while self.effort < REFINING_EFFORT && kept.len() > 2 {
-            let mut best: Option<(f64, usize)> = None;
-            for j in 1..kept.len() - 1 {
-                let mut without = kept.clone();
-                without.remove(j);
-                let limit = best.map_or(f64::INFINITY, |b| b.0);
-                if let Some(error_m) = self.worst(&without, limit) {
-                    best = Some((error_m, j));
-                }
-            }
-            let Some((error_m, j)) = best else { break };
             let mut without = kept.clone();
             without.remove(j);
-            if error_m > self.bound_m && !self.relocate(&mut without, error_m) {
+            costs.push((search.fit(&without, bound, 4.0 * bound), j));
+        }
+        costs.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut dropped = false;
+        for &(error_m, j) in costs.iter().take(6) {
+            let mut without = kept.clone();
+            without.remove(j);
+            if error_m.is_finite() && relocate(search, &mut without, error_m, j, bound) {
+                *kept = without;
+                accept(search, kept)?;
+                dropped = true;
                 break;
             }
-            *kept = without;
+        }
+        if !dropped {
+            break;
         }
     }
+    Ok(())
+}
 
-    fn thin(&mut self, kept: &mut Vec<usize>) {
-        let mut j = 1;
-        while j + 1 < kept.len() && self.effort < REFINING_EFFORT {
-            let dropped = kept.remove(j);
-            // `worst` is below its limit; the bound itself is allowed.
-            if self.worst(kept, self.bound_m.next_up()).is_none() {
-                kept.insert(j, dropped);
-                j += 1;
+/// Moves single points while that lowers the largest error, from the gap at `j` outwards; true once the
+/// bound holds (with its values in `search`).
+fn relocate<const D: usize>(
+    search: &mut Search<'_, D>,
+    kept: &mut [usize],
+    mut error_m: f64,
+    gap: usize,
+    bound: f64,
+) -> bool {
+    if error_m <= bound {
+        return search.fit(kept, bound, bound) <= bound;
+    }
+    let mut order: Vec<usize> = (1..kept.len() - 1).collect();
+    order.sort_by_key(|&j| (2 * j + 1).abs_diff(2 * gap));
+    let mut moved = true;
+    while moved && search.effort < REFINING_EFFORT {
+        moved = false;
+        for &j in &order {
+            if search.effort >= REFINING_EFFORT {
+                return false;
             }
-        }
-    }
-
-    /// Moves single points while that lowers the largest error; true once the bound holds.
-    fn relocate(&mut self, kept: &mut [usize], mut error_m: f64) -> bool {
-        let mut moved = true;
-        while moved && self.effort < REFINING_EFFORT {
-            moved = false;
-            for j in 1..kept.len() - 1 {
-                for step in [-4, -2, -1, 1, 2, 4] {
-                    let before = kept[j];
-                    let Some(after) = before.checked_add_signed(step) else {
-                        continue;
-                    };
-                    if after <= kept[j - 1] || after >= kept[j + 1] {
-                        continue;
+            for step in [-4, -2, -1, 1, 2, 4] {
+                let before = kept[j];
+                let Some(after) = before.checked_add_signed(step) else {
+                    continue;
+                };
+                if after <= kept[j - 1] || after >= kept[j + 1] {
+                    continue;
+                }
+                if !search.apart(kept[j - 1], after) || !search.apart(after, kept[j + 1]) {
+                    continue;
+                }
+                kept[j] = after;
+                let lower_m = search.fit(kept, bound, error_m);
+                if lower_m < error_m {
+                    error_m = lower_m;
+                    moved = true;
+                    if error_m <= bound {
+                        return true;
                     }
-                    kept[j] = after;
-                    match self.worst(kept, error_m) {
-                        Some(lower_m) => {
-                            error_m = lower_m;
-                            moved = true;
-                            if error_m <= self.bound_m {
-                                return true;
-                            }
-                        }
-                        None => kept[j] = before,
-                    }
+                } else {
+                    kept[j] = before;
                 }
             }
         }
-        false
     }
-
-    fn may_insert(&self, kept: &[usize], i: usize) -> bool {
-        let at = kept.partition_point(|&k| k < i);
-        kept.get(at).is_none_or(|&k| k != i && self.apart(i, k))
-            && (at == 0 || self.apart(kept[at - 1], i))
-    }
-
-    fn apart(&self, i: usize, j: usize) -> bool {
-        let tick_s = self.grid.tick_s();
-        (self.point(j).t_s - self.point(i).t_s) / tick_s > 0.5
-    }
-
-    /// Sample `i` moved along its slope to the grid's nearest tick (outwards at the ends, so that the
-    /// decoded curve covers every sample).
-    fn point(&self, i: usize) -> Checkpoint<D> {
-        let tick_s = self.grid.tick_s();
-        let ticks = self.t[i] / tick_s;
-        let whole = if (ticks - ticks.round()).abs() < 1e-6 {
-            ticks.round()
-        } else if i == 0 {
-            ticks.floor()
-        } else if i == self.t.len() - 1 {
-            ticks.ceil()
-        } else {
-            ticks.round()
-        };
-        let t_s = whole * tick_s;
-        Checkpoint {
-            t_s,
-            x: self.y[i] + self.slopes[i] * (t_s - self.t[i]),
-        }
-    }
-
-    fn plan(&self, kept: &[usize]) -> Result<Plan<D>, CheckpointError> {
-        let points: Vec<_> = kept.iter().map(|&i| self.point(i)).collect();
-        Plan::quantise(self.grid, &points)
-    }
-
-    /// The distance of every sample from the decoded curve, m.
-    fn errors(&mut self, kept: &[usize]) -> Result<Vec<f64>, CheckpointError> {
-        let mut errors = Vec::with_capacity(self.t.len());
-        self.visit(kept, |e| {
-            errors.push(e);
-            true
-        })?;
-        Ok(errors)
-    }
-
-    /// The largest distance, m, if it is below `limit_m`.
-    fn worst(&mut self, kept: &[usize], limit_m: f64) -> Option<f64> {
-        let mut worst = 0.0;
-        self.visit(kept, |e: f64| {
-            worst = e.max(worst);
-            worst < limit_m
-        })
-        .ok()?;
-        (worst < limit_m).then_some(worst)
-    }
-
-    fn visit(
-        &mut self,
-        kept: &[usize],
-        mut go_on: impl FnMut(f64) -> bool,
-    ) -> Result<(), CheckpointError> {
-        let spline = self.plan(kept)?.spline()?;
-        self.effort += 2 * kept.len();
-        let (start_s, end_s) = spline.span_s();
-        for (&t, y) in self.t.iter().zip(self.y) {
-            self.effort += 1;
-            // A sample on the end's tick may lie a rounding error outside.
-            let decoded = spline.eval(t.clamp(start_s, end_s))?;
-            if !go_on((decoded.x - y).norm()) {
-                break;
-            }
-        }
-        Ok(())
-    }
+    false
 }
 
-/// The slope at each sample of the parabola through it and its neighbours (of the line at the ends).
-fn slopes<const D: usize>(t: &[f64], y: &[SVector<f64, D>]) -> Vec<SVector<f64, D>> {
-    let secant = |i: usize| (y[i + 1] - y[i]) / (t[i + 1] - t[i]);
-    let n = t.len();
-    (0..n)
-        .map(|i| match i {
-            0 => secant(0),
-            _ if i == n - 1 => secant(n - 2),
-            _ => {
-                let (before, after) = (t[i] - t[i - 1], t[i + 1] - t[i]);
-                (secant(i - 1) * after + secant(i) * before) / (before + after)
-            }
-        })
-        .collect()
+/// `plan`, if what it decodes to passes every sample within the bound.
+fn verified<const D: usize>(
+    plan: Plan<D>,
+    motion: &Motion<'_, D>,
+    bound_m: f64,
+) -> Result<Plan<D>, CheckpointError> {
+    let spline = plan.spline()?;
+    let (start_s, end_s) = spline.span_s();
+    for (index, (&t, y)) in motion.t.iter().zip(motion.y).enumerate() {
+        // A sample on the end's tick may lie a rounding error outside.
+        let error_m = (spline.eval(t.clamp(start_s, end_s))?.x - y).norm();
+        if error_m > bound_m {
+            return Err(CheckpointError::Unreachable { index, error_m });
+        }
+    }
+    Ok(plan)
 }
 
 #[cfg(test)]

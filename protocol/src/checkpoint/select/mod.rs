@@ -1,7 +1,11 @@
 //! Which moments of a finished motion to keep.
 
 mod bounded;
+mod counted;
+mod fit;
 mod publication;
+mod search;
 
-pub use bounded::bounded;
+pub use bounded::{Effort, bounded, bounded_with};
+pub use counted::counted;
 pub use publication::{gradient, publication};

@@ -71,6 +71,39 @@ fn a_line_needs_its_ends_only() {
 }
 
 #[test]
+fn a_hand_that_rests_costs_two_points() {
+    let t: Vec<f64> = (0..100).map(|i| f64::from(i) * 0.01).collect();
+    let plan = bounded(&t, &[Vector3::new(0.3, -1.2, 0.7); 100], 1e-3).unwrap();
+    assert_eq!(plan.len(), 2);
+    assert!(plan.byte_len() < 25, "{} bytes", plan.byte_len());
+}
+
+#[test]
+fn a_hasty_choice_holds_the_bound_too() {
+    let hand = load("hand3d.json");
+    let y = hand["y"].as_array().unwrap().iter();
+    let y: Vec<_> = y.map(|p| Vector3::from_iterator(list(p))).collect();
+    let t = list(&hand["t"]);
+    let hasty = bounded_with(&t, &y, 0.002, Effort::Quick).unwrap();
+    let thorough = bounded(&t, &y, 0.002).unwrap();
+    assert!(largest_error(&hasty, &t, &y) <= 0.002);
+    assert!(largest_error(&thorough, &t, &y) <= 0.002);
+    assert!(thorough.byte_len() < hasty.byte_len());
+}
+
+#[test]
+fn one_sample_is_no_motion() {
+    assert_eq!(
+        bounded(&[0.0], &[Vector1::new(1.0)], 0.1),
+        Err(CheckpointError::TooFew { count: 1, least: 2 })
+    );
+    assert!(matches!(
+        bounded(&[0.0, 1.0], &[Vector1::new(1.0); 2], 1e-9),
+        Err(CheckpointError::BoundTooFine { .. })
+    ));
+}
+
+#[test]
 fn bad_input_is_named() {
     let y = [Vector1::new(0.0), Vector1::new(1.0)];
     assert!(matches!(
