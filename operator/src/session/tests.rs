@@ -15,6 +15,7 @@ use super::*;
 
 mod commands;
 mod mirroring;
+mod posing;
 
 const MS: i64 = 1_000_000;
 const EPOCH: u32 = 17;

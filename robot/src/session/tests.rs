@@ -18,6 +18,7 @@ use crate::servo::Mapping;
 mod control;
 mod datagrams;
 mod path;
+mod posing;
 
 const MS: i64 = 1_000_000;
 const EPOCH: u32 = 41;
