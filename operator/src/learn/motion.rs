@@ -107,7 +107,10 @@ fn memorises(fit: &Fit<4>) -> bool {
     let of_few = |d: &&Degenerate| matches!(d, Degenerate::Shrunk { .. });
     let few = fit.degenerate.iter().filter(of_few).count();
     let of_a_moment = |d: &Degenerate| match *d {
-        Degenerate::Floored { axis, components } if axis == 0 => components,
+        Degenerate::Floored {
+            axis: 0,
+            components,
+        } => components,
         _ => 0,
     };
     let moments: usize = fit.degenerate.iter().map(of_a_moment).sum();

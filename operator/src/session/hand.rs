@@ -1,5 +1,6 @@
 //! The hand as the session knows it: position, and what else the input has.
 
+use nalgebra::UnitQuaternion;
 use telemime_protocol::predict::{Forecast, HandState, Params, TurnForecast, TurnState};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::wire::state::WireState;
@@ -20,9 +21,7 @@ impl Hand {
     /// The hand after its first sample; `None` if that is not finite.
     pub(super) fn first(sample: &HandSample) -> Option<Self> {
         let finite = sample.x.iter().all(|v| v.is_finite());
-        let turn = sample
-            .orientation
-            .filter(|q| q.coords.iter().all(|v| v.is_finite()));
+        let turn = sample.orientation.filter(is_rotation);
         finite.then(|| Self {
             place: HandState::first(sample.t, sample.x),
             turn: turn.map(|q| TurnState::first(sample.t, q)),
@@ -36,9 +35,7 @@ impl Hand {
         if !self.place.advance(sample.t, sample.x) {
             return false;
         }
-        let seen = sample
-            .orientation
-            .filter(|q| q.coords.iter().all(|v| v.is_finite()));
+        let seen = sample.orientation.filter(is_rotation);
         match &mut self.turn {
             Some(turn) => {
                 turn.advance(sample.t, seen.unwrap_or(turn.q));
@@ -48,6 +45,11 @@ impl Hand {
         self.grip = grip(sample).or(self.grip);
         true
     }
+}
+
+/// Written so that NaN fails too.
+fn is_rotation(q: &UnitQuaternion<f64>) -> bool {
+    (q.coords.norm_squared() - 1.0).abs() < 1e-3
 }
 
 fn grip(sample: &HandSample) -> Option<f64> {
