@@ -20,8 +20,9 @@ use crate::figure::{
 /// Curves are drawn through this many steps.
 const STEPS: u32 = 240;
 
-/// An ellipse is drawn with this many corners.
+/// An ellipse is drawn with this many corners; one of the many that a region sweeps over, with fewer.
 const CORNERS: u32 = 48;
+const SWEPT_CORNERS: u32 = 24;
 
 /// More ellipses than this hide each other where a motion returns to the same places.
 const MOST_IN_PLAN: usize = 24;
@@ -222,7 +223,7 @@ fn swept(subject: &Subject, a: usize, b: usize) -> anyhow::Result<Vec<Points>> {
             let at = subject.motion.at(t_s);
             let s = at.covariance;
             let block = Matrix2::new(s[(a, a)], s[(a, b)], s[(b, a)], s[(b, b)]);
-            ellipse([at.mean[a], at.mean[b]], block, radius)
+            ellipse([at.mean[a], at.mean[b]], block, radius, SWEPT_CORNERS)
         })
         .collect();
     let pair = |w: &[Points]| hull(w.concat());
@@ -251,16 +252,16 @@ fn hull(mut points: Points) -> Points {
 }
 
 /// The points so many deviations from the mean, the first again at the end.
-fn ellipse(mean: [f64; 2], covariance: Matrix2<f64>, radius: f64) -> Points {
+fn ellipse(mean: [f64; 2], covariance: Matrix2<f64>, radius: f64, corners: u32) -> Points {
     let eigen = SymmetricEigen::new(covariance);
     let reach = eigen.eigenvalues.map(|v| v.max(0.0).sqrt()) * radius;
     let corner = |i: u32| {
-        let angle = std::f64::consts::TAU * f64::from(i) / f64::from(CORNERS);
+        let angle = std::f64::consts::TAU * f64::from(i) / f64::from(corners);
         let on_axes = Vector2::new(angle.cos(), angle.sin()).component_mul(&reach);
         let at = eigen.eigenvectors * on_axes;
         (mean[0] + at.x, mean[1] + at.y)
     };
-    (0..=CORNERS).map(corner).collect()
+    (0..=corners).map(corner).collect()
 }
 
 /// The mixture's components in two of its coordinates.
@@ -269,7 +270,7 @@ fn ellipses(subject: &Subject, of: [usize; 2]) -> anyhow::Result<Vec<Layer>> {
     let layer = |(i, c): (usize, &Component<4>)| {
         let s = c.covariance();
         let block = Matrix2::from_fn(|a, b| s[(of[a], of[b])]);
-        let outline = ellipse([c.mean()[of[0]], c.mean()[of[1]]], block, radius);
+        let outline = ellipse([c.mean()[of[0]], c.mean()[of[1]]], block, radius, CORNERS);
         let label = if i == 0 { "Gaussians" } else { "" };
         Layer::new(label, ORANGE, Shape::Thin(outline))
     };
@@ -413,14 +414,14 @@ mod tests {
     fn an_ellipse_is_where_the_density_says() {
         let covariance = Matrix2::new(2.0, 0.9, 0.9, 0.5);
         let inverse = covariance.try_inverse().unwrap();
-        let outline = ellipse([1.0, -2.0], covariance, 1.5);
+        let outline = ellipse([1.0, -2.0], covariance, 1.5, 48);
         assert_eq!(outline.first(), outline.last());
         for (x, y) in outline {
             let e = Vector2::new(x - 1.0, y + 2.0);
             assert!(((e.transpose() * inverse * e)[0].sqrt() - 1.5).abs() < 1e-9);
         }
         // Of no spread across, a line.
-        let flat = ellipse([0.0, 0.0], Matrix2::new(4.0, 0.0, 0.0, 0.0), 1.0);
+        let flat = ellipse([0.0, 0.0], Matrix2::new(4.0, 0.0, 0.0, 0.0), 1.0, 48);
         assert!(
             flat.iter()
                 .all(|p| p.1.abs() < 1e-12 && p.0.abs() < 2.0 + 1e-12)
