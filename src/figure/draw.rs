@@ -50,8 +50,12 @@ pub(super) fn png(figure: &Figure, path: &Path) -> Drawn {
     let small = averaged(&large, large_w as usize, OVERSAMPLE as usize);
     let mut file = BitMapBackend::new(path, (w, h));
     file.blit_bitmap((0, 0), (w, h), &small)
-        .and_then(|()| file.present())
-        .map_err(draw_error)
+        .map_err(draw_error)?;
+    // What is drawn is in memory: all that can fail now is the file.
+    file.present().map_err(|e| FigureError::Write {
+        path: path.to_owned(),
+        source: std::io::Error::other(e),
+    })
 }
 
 /// Blocks of `factor`² RGB pixels averaged.

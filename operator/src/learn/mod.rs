@@ -316,15 +316,22 @@ fn all_or_none(
 /// Durations vary by 5 % at least: a handful of performances cannot show less.
 const LEAST_DEVIATION_LN: f64 = 0.05;
 
+/// One performance shows nothing of how durations vary; one person's of one recorded gesture do by 0.06 to 0.25.
+const UNTRIED_DEVIATION_LN: f64 = 0.15;
+
 /// The log-normal distribution of the durations.
 fn pace(demonstrations: &[Demonstration]) -> Pace {
     let n = demonstrations.len() as f64;
     let ln: Vec<f64> = demonstrations.iter().map(|d| d.duration_s().ln()).collect();
     let mean_ln_s = ln.iter().sum::<f64>() / n;
     let square = ln.iter().map(|v| (v - mean_ln_s).powi(2)).sum::<f64>();
+    let deviation_ln = match demonstrations {
+        [_] => UNTRIED_DEVIATION_LN,
+        _ => (square / (n - 1.0)).sqrt().max(LEAST_DEVIATION_LN),
+    };
     Pace {
         mean_ln_s,
-        deviation_ln: (square / (n - 1.0).max(1.0)).sqrt().max(LEAST_DEVIATION_LN),
+        deviation_ln,
     }
 }
 
