@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use nalgebra::{Matrix2, SymmetricEigen, Vector2, Vector3};
+use plotters::style::RGBColor;
 use telemime_operator::demonstration::{Demonstration, Demonstrations};
 use telemime_operator::learn::align::{Aligned, align};
 use telemime_operator::learn::tube::{BeforeAfter, Tube, proportional};
@@ -13,17 +14,21 @@ use telemime_protocol::pose;
 use telemime_protocol::skill::{Component, Gmr, Skill, chi_squared_quantile};
 
 use crate::figure::{
-    BLACK, BLUE, Figure, GREEN, GREY, Layer, ORANGE, Panel, SKY, Shape, VERMILLION,
+    BLACK, BLUE, Figure, GREEN, GREY, Layer, ORANGE, Panel, SILVER, SKY, Shape, VERMILLION,
 };
 
 /// Curves are drawn through this many steps.
 const STEPS: u32 = 240;
 
-/// An ellipse is drawn with this many corners.
+/// An ellipse is drawn with this many corners; one of the many that a region sweeps over, with fewer.
 const CORNERS: u32 = 48;
+const SWEPT_CORNERS: u32 = 24;
 
 /// More ellipses than this hide each other where a motion returns to the same places.
 const MOST_IN_PLAN: usize = 24;
+
+/// More demonstrations than this are drawn paler: together they would hide the region.
+const FEW: usize = 10;
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 
@@ -86,9 +91,9 @@ pub(crate) fn figure(subject: &Subject) -> anyhow::Result<Figure> {
     Ok(Figure {
         title: format!("Skill: {}", skill.name()),
         note: format!(
-            "{} Gaussians over (t, x, y, z), regressed on time; regions and ellipses hold {:.0} %{shown}",
+            "{} Gaussians over (t, x, y, z), regressed on time; regions and ellipses hold {} %{shown}",
             skill.motion().components().len(),
-            subject.confidence * 100.0
+            percent(subject.confidence)
         ),
         columns: 3,
         panels,
@@ -101,6 +106,15 @@ fn radius(subject: &Subject, degrees: u32) -> anyhow::Result<f64> {
     Ok(radius2
         .context("--confidence must be at least 0 and below 1")?
         .sqrt())
+}
+
+fn region(subject: &Subject) -> String {
+    format!("{} % region", percent(subject.confidence))
+}
+
+/// A share in percent, with no more digits than it has.
+fn percent(share: f64) -> f64 {
+    (share * 1e6).round() / 1e4
 }
 
 fn times_s(skill: &Skill) -> impl Iterator<Item = f64> {
@@ -123,11 +137,15 @@ fn shown_layers(
         let points = points.map(|(t, x)| flat(t * stretch, x)).collect();
         Layer::new(
             if i == 0 { "demonstrations" } else { "" },
-            GREY,
+            shade(aligned.paths.len()),
             Shape::Thin(points),
         )
     };
     aligned.paths.iter().enumerate().map(layer).collect()
+}
+
+fn shade(demonstrations: usize) -> RGBColor {
+    if demonstrations > FEW { SILVER } else { GREY }
 }
 
 fn over_time(subject: &Subject, aligned: Option<&Aligned>, d: usize) -> anyhow::Result<Panel> {
@@ -139,7 +157,7 @@ fn over_time(subject: &Subject, aligned: Option<&Aligned>, d: usize) -> anyhow::
         mean.push((t_s, at.mean[d]));
         band.push((t_s, at.mean[d] - half, at.mean[d] + half));
     }
-    let mut layers = vec![Layer::new("region", SKY, Shape::Band(band))];
+    let mut layers = vec![Layer::new(region(subject), SKY, Shape::Band(band))];
     layers.extend(shown_layers(subject, aligned, |t_s, x| (t_s, x[d])));
     if !subject.motion.is_moved() {
         layers.extend(ellipses(subject, [0, d + 1])?);
@@ -168,7 +186,9 @@ fn plan_view(
     a: usize,
     b: usize,
 ) -> anyhow::Result<Panel> {
-    let mut layers = shown_layers(subject, aligned, |_, x| (x[a], x[b]));
+    let swept = Shape::Patches(swept(subject, a, b)?);
+    let mut layers = vec![Layer::new(region(subject), SKY, swept)];
+    layers.extend(shown_layers(subject, aligned, |_, x| (x[a], x[b])));
     let count = subject.skill.motion().components().len();
     if !subject.motion.is_moved() && count <= MOST_IN_PLAN {
         layers.extend(ellipses(subject, [a + 1, b + 1])?);
@@ -195,26 +215,64 @@ fn plan_view(
     })
 }
 
+/// What the region of one moment sweeps over on its way to the next, for every moment.
+fn swept(subject: &Subject, a: usize, b: usize) -> anyhow::Result<Vec<Points>> {
+    let radius = radius(subject, 2)?;
+    let outlines: Vec<Points> = times_s(subject.skill)
+        .map(|t_s| {
+            let at = subject.motion.at(t_s);
+            let s = at.covariance;
+            let block = Matrix2::new(s[(a, a)], s[(a, b)], s[(b, a)], s[(b, b)]);
+            ellipse([at.mean[a], at.mean[b]], block, radius, SWEPT_CORNERS)
+        })
+        .collect();
+    let pair = |w: &[Points]| hull(w.concat());
+    Ok(outlines.windows(2).map(pair).collect())
+}
+
+/// The convex hull of points, by Andrew's monotone chain: the corners, counter-clockwise.
+fn hull(mut points: Points) -> Points {
+    points.sort_by(|p, q| p.0.total_cmp(&q.0).then(p.1.total_cmp(&q.1)));
+    let half = |points: &mut dyn Iterator<Item = (f64, f64)>| {
+        let mut chain = Points::new();
+        for p in points {
+            while let [.., o, q] = chain[..]
+                && (q.0 - o.0) * (p.1 - o.1) <= (q.1 - o.1) * (p.0 - o.0)
+            {
+                chain.pop();
+            }
+            chain.push(p);
+        }
+        chain.pop();
+        chain
+    };
+    let mut corners = half(&mut points.iter().copied());
+    corners.extend(half(&mut points.iter().rev().copied()));
+    corners
+}
+
+/// The points so many deviations from the mean, the first again at the end.
+fn ellipse(mean: [f64; 2], covariance: Matrix2<f64>, radius: f64, corners: u32) -> Points {
+    let eigen = SymmetricEigen::new(covariance);
+    let reach = eigen.eigenvalues.map(|v| v.max(0.0).sqrt()) * radius;
+    let corner = |i: u32| {
+        let angle = std::f64::consts::TAU * f64::from(i) / f64::from(corners);
+        let on_axes = Vector2::new(angle.cos(), angle.sin()).component_mul(&reach);
+        let at = eigen.eigenvectors * on_axes;
+        (mean[0] + at.x, mean[1] + at.y)
+    };
+    (0..=corners).map(corner).collect()
+}
+
 /// The mixture's components in two of its coordinates.
 fn ellipses(subject: &Subject, of: [usize; 2]) -> anyhow::Result<Vec<Layer>> {
     let radius = radius(subject, 2)?;
     let layer = |(i, c): (usize, &Component<4>)| {
         let s = c.covariance();
         let block = Matrix2::from_fn(|a, b| s[(of[a], of[b])]);
-        let eigen = SymmetricEigen::new(block);
-        let corner = |i: u32| {
-            let angle = std::f64::consts::TAU * f64::from(i) / f64::from(CORNERS);
-            let on_circle = Vector2::new(angle.cos(), angle.sin()) * radius;
-            let stretched = on_circle.component_mul(&eigen.eigenvalues.map(|v| v.max(0.0).sqrt()));
-            let at = eigen.eigenvectors * stretched;
-            (c.mean()[of[0]] + at.x, c.mean()[of[1]] + at.y)
-        };
+        let outline = ellipse([c.mean()[of[0]], c.mean()[of[1]]], block, radius, CORNERS);
         let label = if i == 0 { "Gaussians" } else { "" };
-        Layer::new(
-            label,
-            ORANGE,
-            Shape::Thin((0..=CORNERS).map(corner).collect()),
-        )
+        Layer::new(label, ORANGE, Shape::Thin(outline))
     };
     let components = subject.skill.motion().components();
     Ok(components.iter().enumerate().map(layer).collect())
@@ -246,10 +304,14 @@ fn before_and_after(subject: &Subject, aligned: &Aligned) -> [Panel; 2] {
         for (n, path) in paths.iter().enumerate() {
             let points = path.iter().enumerate().map(|(i, x)| (share(i), x[d]));
             let label = if n == 0 { "demonstrations" } else { "" };
-            layers.push(Layer::new(label, GREY, Shape::Thin(points.collect())));
+            layers.push(Layer::new(
+                label,
+                shade(paths.len()),
+                Shape::Thin(points.collect()),
+            ));
         }
         Panel {
-            title: format!("{what}: {:.1} mm", tube.deviation_m() * 1e3),
+            title: format!("{what}: {:.1} mm from their mean", tube.deviation_m() * 1e3),
             x_label: "share of the performance".into(),
             y_label: format!("{} / m", AXES[d]),
             equal_axes: false,
@@ -285,7 +347,11 @@ fn turning(subject: &Subject, aligned: Option<&Aligned>) -> anyhow::Result<Optio
         }
     }
     for (d, band) in bands.into_iter().enumerate() {
-        let label = if d == 0 { "region" } else { "" };
+        let label = if d == 0 {
+            region(subject)
+        } else {
+            String::new()
+        };
         layers.push(Layer::new(label, SKY, Shape::Band(band)));
     }
     if let Some(aligned) = aligned {
@@ -297,7 +363,11 @@ fn turning(subject: &Subject, aligned: Option<&Aligned>) -> anyhow::Result<Optio
                     let q = demo.orientation_at(start_s + own_s)?;
                     Some((t * stretch, degrees(pose::between(&start, &q)[d])))
                 });
-                layers.push(Layer::new("", GREY, Shape::Thin(points.collect())));
+                layers.push(Layer::new(
+                    "",
+                    shade(aligned.paths.len()),
+                    Shape::Thin(points.collect()),
+                ));
             }
         }
     }
@@ -334,4 +404,37 @@ fn gripping(subject: &Subject) -> anyhow::Result<Option<Panel>> {
         doubling: false,
         layers: vec![Layer::new("inferred", BLUE, Shape::Line(mean))],
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_ellipse_is_where_the_density_says() {
+        let covariance = Matrix2::new(2.0, 0.9, 0.9, 0.5);
+        let inverse = covariance.try_inverse().unwrap();
+        let outline = ellipse([1.0, -2.0], covariance, 1.5, 48);
+        assert_eq!(outline.first(), outline.last());
+        for (x, y) in outline {
+            let e = Vector2::new(x - 1.0, y + 2.0);
+            assert!(((e.transpose() * inverse * e)[0].sqrt() - 1.5).abs() < 1e-9);
+        }
+        // Of no spread across, a line.
+        let flat = ellipse([0.0, 0.0], Matrix2::new(4.0, 0.0, 0.0, 0.0), 1.0, 48);
+        assert!(
+            flat.iter()
+                .all(|p| p.1.abs() < 1e-12 && p.0.abs() < 2.0 + 1e-12)
+        );
+    }
+
+    #[test]
+    fn a_hull_has_the_outer_points_and_no_others() {
+        let square = [(0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0)];
+        let mut points: Points = square.to_vec();
+        points.extend([(1.0, 1.0), (1.0, 0.0), (0.5, 1.5), (2.0, 2.0)]);
+        assert_eq!(hull(points), square);
+        assert!(hull(vec![(1.0, 1.0)]).len() <= 1);
+        assert_eq!(hull(vec![(0.0, 0.0), (1.0, 0.0), (2.0, 0.0)]).len(), 2);
+    }
 }

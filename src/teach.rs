@@ -10,6 +10,7 @@ use telemime_operator::placed::{Motion, Placed};
 use telemime_operator::skill_file;
 use telemime_protocol::skill::Skill;
 
+use crate::figure;
 use crate::picture::{self, Subject};
 
 /// Learn a skill from a folder of demonstrations (CSV: t,x,y,z; one file each) and save it.
@@ -89,6 +90,9 @@ pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
     let [dir] = args.dirs.as_slice() else {
         bail!("one folder makes one skill; with --update several refine one");
     };
+    if let Some(drawing) = &args.figure {
+        figure::check(drawing)?;
+    }
     let found = Demonstrations::read_dir(dir, args.matching.as_deref())?;
     found
         .notices

@@ -219,7 +219,7 @@ where
                     area.draw(&PathElement::new([(from, y), (from + 2 * gap, y)], line))
                 })
             }
-            Shape::Band(_) | Shape::Tube(..) => area.draw(&Rectangle::new(
+            Shape::Band(_) | Shape::Patches(_) | Shape::Tube(..) => area.draw(&Rectangle::new(
                 [(x, y - px(5.0)), (x + swatch, y + px(5.0))],
                 pale(one.colour).filled(),
             )),
@@ -268,6 +268,13 @@ where
             outline.extend(p.rev().map(|p| (p.0, p.2)));
             axes.draw_series([Polygon::new(outline, fill)]).map(|_| ())
         }
+        Shape::Patches(patches) => axes
+            .draw_series(
+                patches
+                    .iter()
+                    .map(|p| Polygon::new(finite(p).collect::<Vec<_>>(), fill)),
+            )
+            .map(|_| ()),
         Shape::Tube(p, radius) => tube(&finite(p).collect::<Vec<_>>(), *radius, axes, fill),
         Shape::Dots(p) => axes
             .draw_series(finite(p).flat_map(|p| {
@@ -334,6 +341,9 @@ fn ranges(
             | Shape::Dots(p)
             | Shape::Rings(p) => {
                 p.iter().for_each(|p| reach(p.0, p.1, 0.0));
+            }
+            Shape::Patches(patches) => {
+                patches.iter().flatten().for_each(|p| reach(p.0, p.1, 0.0));
             }
             Shape::Tube(p, radius) => p.iter().for_each(|p| reach(p.0, p.1, *radius)),
             Shape::Band(p) => p.iter().for_each(|p| {

@@ -7,7 +7,7 @@ mod draw;
 mod theme;
 
 use std::path::{Path, PathBuf};
-pub(crate) use theme::{BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILLION};
+pub(crate) use theme::{BLACK, BLUE, GREEN, GREY, ORANGE, SILVER, SKY, VERMILLION};
 
 use plotters::style::RGBColor;
 
@@ -64,6 +64,8 @@ pub(crate) enum Shape {
     Dashed(Vec<(f64, f64)>),
     /// The area between two curves over the same abscissa: (x, low, high).
     Band(Vec<(f64, f64, f64)>),
+    /// The union of convex polygons, given by their corners in order.
+    Patches(Vec<Vec<(f64, f64)>>),
     /// Everything within a radius of a path, for equal axes.
     Tube(Vec<(f64, f64)>, f64),
     /// A dot at each point.
@@ -111,29 +113,49 @@ impl Figure {
     /// # Errors
     /// [`FigureError`]; nothing half-drawn is left behind.
     pub(crate) fn write(&self, path: &Path) -> Result<(), FigureError> {
-        if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty())
-            && !folder.is_dir()
-        {
-            return Err(FigureError::Write {
-                path: path.to_owned(),
-                source: std::io::Error::new(
-                    std::io::ErrorKind::NotFound,
-                    "its folder does not exist; make it first",
-                ),
-            });
-        }
-        let ending = path.extension().and_then(|e| e.to_str()).unwrap_or("");
-        match ending.to_ascii_lowercase().as_str() {
-            "svg" => {
+        match format(path)? {
+            Format::Svg => {
                 let text = draw::svg(self)?;
                 std::fs::write(path, text).map_err(|source| FigureError::Write {
                     path: path.to_owned(),
                     source,
                 })
             }
-            "png" => draw::png(self, path),
-            _ => Err(FigureError::Ending(path.to_owned())),
+            Format::Png => draw::png(self, path),
         }
+    }
+}
+
+/// Whether a figure may go there, to be asked before the work that it shows.
+///
+/// # Errors
+/// [`FigureError::Ending`], or [`FigureError::Write`] if there is no such folder.
+pub(crate) fn check(path: &Path) -> Result<(), FigureError> {
+    format(path).map(|_| ())
+}
+
+enum Format {
+    Svg,
+    Png,
+}
+
+fn format(path: &Path) -> Result<Format, FigureError> {
+    if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty())
+        && !folder.is_dir()
+    {
+        return Err(FigureError::Write {
+            path: path.to_owned(),
+            source: std::io::Error::new(
+                std::io::ErrorKind::NotFound,
+                "its folder does not exist; make it first",
+            ),
+        });
+    }
+    let ending = path.extension().and_then(|e| e.to_str()).unwrap_or("");
+    match ending.to_ascii_lowercase().as_str() {
+        "svg" => Ok(Format::Svg),
+        "png" => Ok(Format::Png),
+        _ => Err(FigureError::Ending(path.to_owned())),
     }
 }
 

@@ -12,6 +12,7 @@ pub(crate) const GREEN: RGBColor = RGBColor(0, 158, 115);
 pub(crate) const BLUE: RGBColor = RGBColor(0, 114, 178);
 pub(crate) const VERMILLION: RGBColor = RGBColor(213, 94, 0);
 pub(crate) const GREY: RGBColor = RGBColor(128, 128, 134);
+pub(crate) const SILVER: RGBColor = RGBColor(178, 179, 185);
 
 pub(super) const INK: RGBColor = RGBColor(40, 40, 46);
 pub(super) const SOFT_INK: RGBColor = RGBColor(98, 98, 106);

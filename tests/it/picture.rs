@@ -53,6 +53,7 @@ fn a_skill_is_learned_drawn_and_told() {
     for text in [
         "Skill: swing",
         "x over time",
+        "95 % region",
         "Gaussians",
         "demonstrations",
         "in proportional time",
@@ -109,6 +110,19 @@ fn what_cannot_be_drawn_is_said() {
     let dir = tempfile::tempdir().unwrap();
     recordings(&dir.path().join("swing"));
     assert!(telemime(dir.path(), &["learn", "swing"]).status.success());
+    let early = telemime(
+        dir.path(),
+        &["learn", "swing", "-o", "b.skill", "--figure", "b.jpg"],
+    );
+    let text = String::from_utf8(early.stderr).unwrap();
+    assert!(
+        !early.status.success() && text.contains(".svg or .png"),
+        "{text}"
+    );
+    assert!(
+        !dir.path().join("b.skill").exists(),
+        "refused before learning"
+    );
     for (args, words) in [
         (&["--figure", "a.jpg"][..], ".svg or .png"),
         (&["--figure", "none/a.svg"], "make it first"),

@@ -37,13 +37,30 @@ pub fn rows(aligned: &Aligned) -> Vec<Vec<Vector4<f64>>> {
     aligned.paths.iter().enumerate().map(each).collect()
 }
 
+/// Rows (t s, x m, y m, z m) half-way from each aligned sample to the next, which no fit has seen.
+fn between(aligned: &Aligned) -> Vec<Vector4<f64>> {
+    let halves = |path: &Vec<Vector3<f64>>| -> Vec<Vector4<f64>> {
+        let times = aligned.times_s.windows(2);
+        times
+            .zip(path.windows(2))
+            .map(|(t, p)| {
+                let at = (p[0] + p[1]) * 0.5;
+                Vector4::new((t[0] + t[1]) * 0.5, at.x, at.y, at.z)
+            })
+            .collect()
+    };
+    aligned.paths.iter().flat_map(halves).collect()
+}
+
 /// Fits the mixture over (t s, x m, y m, z m), its number of components by BIC.
 ///
 /// The criterion judges what the mixture is for: the likelihood is that of the *regression*, a normal
 /// position at each time. By the joint likelihood a motion to and fro is best told as places the hand
 /// keeps returning to, and its regression over time is one long average. For the same reason both starts
 /// (time bins, k-means++) compete by this criterion, and covariances are not counted ([`bic_of_means`]).
-/// A mixture that learned samples by heart is taken only where there is no other.
+/// A mixture that learned samples by heart is taken only where there is no other; and of the likelihoods at the samples and
+/// half-way between them the lesser counts, since where demonstrations meet (all of them in one goal) components of a moment
+/// or two tell every sample and jump in between.
 ///
 /// # Errors
 /// [`LearnError`], as of the fit.
@@ -53,6 +70,7 @@ pub fn fit(
     progress: &mut impl FnMut(Progress),
 ) -> Result<Gmm<4>, LearnError> {
     let rows = rows(aligned).concat();
+    let between = between(aligned);
     let mut best: Result<(Rank, Fit<4>), LearnError> = Err(LearnError::Components { asked: 0 });
     for components in LADDER
         .into_iter()
@@ -69,7 +87,8 @@ pub fn fit(
             };
             let judged = em::fit(&rows, &em).and_then(|fit| {
                 let score = regression_score::<4, 3>(&fit.gmm, &rows)?;
-                Ok((score, fit))
+                let halfway = regression_score::<4, 3>(&fit.gmm, &between)?;
+                Ok((score.min(halfway), fit))
             });
             match judged {
                 Ok((score, fit)) => {

@@ -57,3 +57,52 @@ fn one_demonstration_is_no_staircase_between_its_samples() {
         }
     }
 }
+
+/// A performance of the publication's first task: all of them begin in one point and end in another, exactly.
+fn task_one(own: &mut impl FnMut() -> f64) -> Vec<Vector3<f64>> {
+    let (width, middle) = (0.25 * (1.0 + 0.1 * own()), 0.5 * (1.0 + 0.1 * own()));
+    let raw = |t: f64| {
+        let bump = (-0.5 * ((t - middle) / width).powi(2)).exp() / (width * 2.5066);
+        3.4 * t.powf(6.971958) + 0.6 * (t + bump)
+    };
+    let points = (0..50).map(|i| f64::from(i) / 49.0);
+    let y = |t| (raw(t) - raw(0.0)) / (raw(1.0) - raw(0.0)) * 2.0;
+    points.map(|t| Vector3::new(t, y(t), 0.0)).collect()
+}
+
+/// Components of a moment near the end told every sample, and between two of them the motion fell by half its height.
+#[test]
+fn where_demonstrations_meet_the_motion_does_not_jump_between_samples() {
+    for seed in [0, 2, 8, 10] {
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
+        // About normal: a sum of uniform numbers.
+        let mut own = || (0..12).map(|_| rng.random_range(-0.5..0.5)).sum();
+        let paths: Vec<_> = (0..10).map(|_| task_one(&mut own)).collect();
+        let demonstrations: Vec<_> = paths
+            .iter()
+            .enumerate()
+            .map(|(n, path)| {
+                let samples: Vec<_> = path.iter().map(|x| Sample::at(x.x, *x)).collect();
+                Demonstration::from_samples(n.to_string(), &samples).unwrap()
+            })
+            .collect();
+        let skill = learn_skill("meet", &demonstrations, &LearnOptions::default(), |_| ());
+        let gmr = Gmr::<1, 3>::new(skill.unwrap().motion()).unwrap();
+        // Beyond 0.9 of the time they are one path.
+        for i in 900..=1000 {
+            let t_s = f64::from(i) / 1000.0;
+            let at = |path: &Vec<Vector3<f64>>| {
+                let sample = ((t_s * 49.0) as usize).min(48);
+                let share = t_s * 49.0 - sample as f64;
+                path[sample].y * (1.0 - share) + path[sample + 1].y * share
+            };
+            let shown = paths.iter().map(at);
+            let (low, high) = shown.fold((f64::MAX, f64::MIN), |(l, h), y| (l.min(y), h.max(y)));
+            let y = gmr.query(&[t_s].into()).mean.y;
+            assert!(
+                y > low - 0.03 && y < high + 0.03,
+                "seed {seed}: {y} m at {t_s} s, shown {low} to {high} m"
+            );
+        }
+    }
+}
