@@ -14,7 +14,7 @@ use telemime_protocol::pose;
 use telemime_protocol::skill::{Component, Gmr, Skill, chi_squared_quantile};
 
 use crate::figure::{
-    BLACK, BLUE, Figure, GREEN, GREY, Layer, ORANGE, Panel, SILVER, SKY, Shape, VERMILLION,
+    AXES, BLACK, BLUE, Figure, GREEN, GREY, Layer, ORANGE, Panel, SILVER, SKY, Shape, VERMILLION,
 };
 
 /// Curves are drawn through this many steps.
@@ -29,8 +29,6 @@ const MOST_IN_PLAN: usize = 24;
 
 /// More demonstrations than this are drawn paler: together they would hide the region.
 const FEW: usize = 10;
-
-const AXES: [&str; 3] = ["x", "y", "z"];
 
 type Points = Vec<(f64, f64)>;
 

@@ -15,7 +15,7 @@ use super::judge::{Verdict, joined};
 use super::processes::Run;
 use super::{Args, Material};
 use crate::figure::{
-    BLACK, BLUE, Figure, GREEN, GREY, Layer, ORANGE, Panel, SKY, Shape, VERMILLION,
+    AXES, BLACK, BLUE, Figure, GREEN, GREY, Layer, ORANGE, Panel, SKY, Shape, VERMILLION,
 };
 use crate::measure::Track;
 use crate::picture::{self, Subject};
@@ -27,8 +27,6 @@ const SHARE: f64 = 0.9;
 const POINTS: usize = 700;
 
 type Points = Vec<(f64, f64)>;
-
-pub(super) const AXES: [&str; 3] = ["x", "y", "z"];
 
 fn axis_label(d: usize) -> String {
     format!("{} / m", AXES[d])

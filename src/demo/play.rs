@@ -8,12 +8,12 @@ use telemime_operator::demonstration::Demonstrations;
 use telemime_operator::learn::align::align;
 use telemime_protocol::spline::{BSpline, End};
 
-use super::figures::{AXES, learned, load_skill, save, tube_panel};
+use super::figures::{learned, load_skill, save, tube_panel};
 use super::judge::{engagement, read_ticks};
 use super::processes::Run;
 use super::summary::{arm, deliver, servo};
 use super::{Args, Material};
-use crate::figure::{BLACK, BLUE, Figure, Layer, ORANGE, Panel, Shape, VERMILLION};
+use crate::figure::{AXES, BLACK, BLUE, Figure, Layer, ORANGE, Panel, Shape, VERMILLION};
 use crate::measure::Track;
 
 /// Kept stable: fields are added, not changed.

@@ -11,6 +11,9 @@ pub(crate) use theme::{BLACK, BLUE, GREEN, GREY, ORANGE, SILVER, SKY, VERMILLION
 
 use plotters::style::RGBColor;
 
+/// The names of the three axes.
+pub(crate) const AXES: [&str; 3] = ["x", "y", "z"];
+
 /// A page of panels, filled row by row.
 #[derive(Clone, Debug)]
 pub(crate) struct Figure {

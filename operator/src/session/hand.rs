@@ -92,13 +92,7 @@ impl Travelling {
                 Some(skill) => skill.predictor().forecast(&state, &params),
                 None => Forecast::constant_velocity(&state, &params),
             },
-            turn: self.pose.turn.map(|turn| {
-                let (state, params) = (turn.dequantise(state.t), turn.params.dequantise());
-                match skill.and_then(Skill::turn) {
-                    Some(turn) => turn.predictor.forecast(&state, &params),
-                    None => TurnForecast::constant_velocity(&state, &params),
-                }
-            }),
+            turn: self.pose.turn.map(|turn| turn.forecast(state.t, skill)),
             grip: self.pose.grip,
         }
     }

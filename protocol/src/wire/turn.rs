@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 use super::codec::DecodeError;
 use super::v1::WireParams;
 use crate::pose;
-use crate::predict::TurnState;
+use crate::predict::{TurnForecast, TurnState};
+use crate::skill::Skill;
 use crate::time::Stamp;
 
 /// Step of rotation vectors on the wire, rad.
@@ -95,6 +96,16 @@ impl WireTurn {
             pose::moved(&q, &back)
         });
         TurnState { t, q, memory }
+    }
+
+    /// The prediction both ends make of it: by the skill's orientation, or by constant angular velocity where
+    /// there is none.
+    pub fn forecast(&self, t: Stamp, skill: Option<&Skill>) -> TurnForecast {
+        let (state, params) = (self.dequantise(t), self.params.dequantise());
+        match skill.and_then(Skill::turn) {
+            Some(turn) => turn.predictor.forecast(&state, &params),
+            None => TurnForecast::constant_velocity(&state, &params),
+        }
     }
 }
 

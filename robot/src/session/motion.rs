@@ -152,17 +152,8 @@ impl Session {
         model: u16,
         turn: Option<&WireTurn>,
     ) -> Option<TurnForecast> {
-        let turn = turn?;
-        let (state, params) = (turn.dequantise(t), turn.params.dequantise());
-        let learned = self
-            .skill
-            .as_ref()
-            .filter(|_| self.predicts_with(model))
-            .and_then(|skill| skill.turn());
-        Some(match learned {
-            Some(learned) => learned.predictor.forecast(&state, &params),
-            None => TurnForecast::constant_velocity(&state, &params),
-        })
+        let skill = self.skill.as_deref().filter(|_| self.predicts_with(model));
+        Some(turn?.forecast(t, skill))
     }
 
     fn predicts_with(&self, model: u16) -> bool {
