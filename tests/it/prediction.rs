@@ -147,6 +147,7 @@ fn rounded(model: &Model) -> Model {
         model.knots(),
         standardisation,
         components,
+        *model.generic(),
         *model.calibration(),
     )
     .unwrap()
@@ -204,30 +205,32 @@ fn evaluate(groups: &[Vec<Demonstration>], most: usize) -> Scores {
     scores
 }
 
+/// Scores every expert, and what the session would have sent.
 fn score(model: &Model, test: &Demonstration, scores: &mut Scores) {
     let end_s = test.last().t_s + 1e-9;
-    let undamped = Params {
-        cv_damping: 1.0,
-        ..Params::default()
-    };
+    let reach_m = test.reach_m();
+    let mut adaptation = Adaptation::of_places(1.0, Some(model.calibration()), reach_m);
+    let mut previous = None;
     for (sample, state) in test.samples().iter().zip(states(test)) {
+        if let Some(previous) = previous.replace(state) {
+            adaptation.observe(&previous, &state, Some(model));
+        }
+        let experts = Forecast::experts(&state, Some(model));
+        let sent = WireParams::quantise(&adaptation.params(&state)).dequantise();
+        let fused = Forecast::fused(&state, &experts, &sent);
         let mixture = model.posterior(&state);
-        let own = model.forecast(&state, &model.calibration().params);
-        let blend = model.forecast(&state, &Params::default());
-        let cv = Forecast::constant_velocity(&state, &undamped);
-        let damped = Forecast::constant_velocity(&state, &Params::default());
         for j in 1..=model.knots() {
             let h_s = j as f64 * KNOT_SPACING_S;
             if sample.t_s + h_s > end_s {
                 break;
             }
             let truth = test.position_at(sample.t_s + h_s) - sample.position;
+            let [_, generic, straight] = experts.displacement[j - 1];
             scores.add("hold", j, truth);
             scores.add("gmr", j, mixture.displacement[j - 1] - truth);
-            scores.add("blend", j, blend.ahead.knots[j].displacement - truth);
-            scores.add("cv", j, cv.ahead.knots[j].displacement - truth);
-            scores.add("damped cv", j, damped.ahead.knots[j].displacement - truth);
-            scores.add("own params", j, own.ahead.knots[j].displacement - truth);
+            scores.add("generic", j, generic - truth);
+            scores.add("straight", j, straight - truth);
+            scores.add("fused", j, fused.ahead.knots[j].displacement - truth);
         }
     }
 }
