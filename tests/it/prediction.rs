@@ -10,7 +10,9 @@ use nalgebra::{SMatrix, Vector3};
 use telemime_operator::demonstration::Demonstration;
 use telemime_operator::learn::PredictorOptions;
 use telemime_operator::learn::predictor::{states, train, train_from_labels};
-use telemime_protocol::predict::{Forecast, KNOT_SPACING_S, Model, Params};
+use telemime_operator::session::adapt::Adaptation;
+use telemime_protocol::predict::{Forecast, KNOT_SPACING_S, Model};
+use telemime_protocol::wire::v1::WireParams;
 
 fn array<const N: usize>(v: &serde_json::Value) -> [f64; N] {
     let v = v.as_array().unwrap();
@@ -199,16 +201,23 @@ fn evaluate(groups: &[Vec<Demonstration>], most: usize) -> Scores {
                 continue;
             }
             let model = train(&others, &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
-            score(&model, test, &mut scores);
+            score(&model, reach_m(&others), test, &mut scores);
         }
     }
     scores
 }
 
+/// The diagonal of the box around them, m.
+fn reach_m(demos: &[Demonstration]) -> f64 {
+    let all = || demos.iter().flat_map(|d| d.samples()).map(|s| s.position);
+    let first = demos[0].samples()[0].position;
+    let (least, most) = all().fold((first, first), |(a, b), x| (a.inf(&x), b.sup(&x)));
+    (most - least).norm()
+}
+
 /// Scores every expert, and what the session would have sent.
-fn score(model: &Model, test: &Demonstration, scores: &mut Scores) {
+fn score(model: &Model, reach_m: f64, test: &Demonstration, scores: &mut Scores) {
     let end_s = test.last().t_s + 1e-9;
-    let reach_m = test.reach_m();
     let mut adaptation = Adaptation::of_places(1.0, Some(model.calibration()), reach_m);
     let mut previous = None;
     for (sample, state) in test.samples().iter().zip(states(test)) {

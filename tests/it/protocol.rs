@@ -10,8 +10,8 @@ use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid, PathKnot};
 use telemime_protocol::checkpoint::{Checkpoint, Grid, Plan, PosePlan};
 use telemime_protocol::pose;
 use telemime_protocol::predict::{
-    BLOCK, Calibration, FEATURES, Forecast, Generic, MAX_KNOTS, Model, Regression, Standardisation, TARGETS,
-    TurnForecast, checksum,
+    BLOCK, Calibration, FEATURES, Forecast, Generic, MAX_KNOTS, Model, Regression, Standardisation,
+    TARGETS, TurnForecast, checksum,
 };
 use telemime_protocol::skill::{Gmm, Pace, Parts, Provenance, Samples, Skill, Source, Stats};
 use telemime_protocol::time::Stamp;
@@ -432,8 +432,14 @@ fn values() -> BTreeMap<String, String> {
     say("straight(3)", vector(&experts.displacement[2][2]));
     say("fused(0.1)", vector(&forecast.at(0.1).position));
     let covariance = forecast.ahead.knots[3].covariance;
-    say("fused V(3) diagonal", vector(&Vector3::new(covariance[0], covariance[3], covariance[5])));
-    say("fused V(3) xy xz yz", vector(&Vector3::new(covariance[1], covariance[2], covariance[4])));
+    say(
+        "fused V(3) diagonal",
+        vector(&Vector3::new(covariance[0], covariance[3], covariance[5])),
+    );
+    say(
+        "fused V(3) xy xz yz",
+        vector(&Vector3::new(covariance[1], covariance[2], covariance[4])),
+    );
     say(
         "fused sigma(0.1)",
         format!("{:.9}", forecast.at(0.1).sigma_m),

@@ -27,7 +27,7 @@ const LONGEST_FRAMES: f64 = 3.0;
 const MEMORY: f64 = 0.93;
 
 /// The calibration weighs as much as this many frames, as long as the motion is familiar.
-const PRIOR: f64 = 10.0;
+const PRIOR: f64 = 15.0;
 
 /// Where it is not, the experts are taken as alike at the first horizon, by this many frames …
 const UNKNOWN: f64 = 0.3;
@@ -45,13 +45,19 @@ const POWER: i32 = 3;
 const FAMILIAR_MEMORY: f64 = 0.9;
 
 /// Less than familiar is unfamiliar: the power of the running mean.
-const FAMILIAR_POWER: i32 = 4;
+const FAMILIAR_POWER: i32 = 8;
 
 /// A mixture that errs (squared) this many times as much as calibrated is not on its model.
-const SURPRISE: f64 = 16.0;
+const SURPRISE: f64 = 32.0;
 
 /// Errors below this are right, m and rad.
 const RIGHT: f64 = 1e-4;
+
+/// A verdict from rest counts as far as the state was unfamiliar: one minus this power of the familiarity.
+const VERDICT_POWER: i32 = 4;
+
+/// How long a hand is seen to rest before it is taken as resting, s: at the first sample nothing is known of before.
+const REST_S: f64 = 0.25;
 
 /// A hand that has moved less than this share of the skill's reach lately is at rest.
 const REST: f64 = 0.02;
@@ -166,6 +172,8 @@ struct Pending<P> {
     origin: P,
     /// Frames it stands for.
     frames: f64,
+    /// Frames that its verdict on the experts counts as.
+    weight: f64,
     said: [Said; BAND_KNOTS.len()],
 }
 
@@ -196,6 +204,8 @@ pub struct Adaptation<C: Course> {
     records: [Record; BAND_KNOTS.len()],
     /// Running mean of the familiarity.
     familiar: Option<f64>,
+    /// For how long the hand has rested, s.
+    rested_s: f64,
     ln_inflation: f64,
     /// For each horizon the oldest entry of `pending` that still waits.
     next: [usize; BAND_KNOTS.len()],
@@ -226,10 +236,17 @@ impl<C: Course> Adaptation<C> {
             learned: start.is_some(),
             records: [Record::default(); BAND_KNOTS.len()],
             familiar: None,
+            rested_s: 0.0,
             ln_inflation: 0.0,
             next: [0; BAND_KNOTS.len()],
             pending: VecDeque::new(),
         }
+    }
+
+    /// The hand is known to have rested for this long before the first sample, s.
+    #[must_use]
+    pub fn rested(self, rested_s: f64) -> Self {
+        Self { rested_s, ..self }
     }
 
     /// The numbers that travel, for a prediction from `hand`.
@@ -254,6 +271,8 @@ impl<C: Course> Adaptation<C> {
             record.frames *= fade;
         }
         self.judge(previous, newest, span_s);
+        let moving = self.moving(newest);
+        self.rested_s = (self.rested_s + span_s) * (1.0 - moving);
 
         let experts = newest.experts(model);
         let fade = FAMILIAR_MEMORY.powf(frames);
@@ -268,6 +287,7 @@ impl<C: Course> Adaptation<C> {
             weights: self.weights(newest),
         };
         let ahead = Ahead::fused(&experts, &params);
+        let unfamiliar = 1.0 - experts.familiarity.powi(VERDICT_POWER);
         let said = BAND_KNOTS.map(|knot| {
             let knot = knot.min(experts.count);
             let fused = &ahead.knots[knot];
@@ -283,6 +303,7 @@ impl<C: Course> Adaptation<C> {
         self.pending.push_back(Pending {
             origin: newest.point(),
             frames,
+            weight: frames * (moving + (1.0 - moving) * unfamiliar),
             said,
         });
     }
@@ -300,11 +321,11 @@ impl<C: Course> Adaptation<C> {
                 let truth = C::between(&previous.point(), &newest.point(), u);
                 let moved = C::way(&pending.origin, &truth);
                 let record = &mut self.records[band];
-                record.frames += pending.frames;
+                record.frames += pending.weight;
                 for (sum, answer) in record.squared.iter_mut().zip(&said.answers) {
-                    *sum += pending.frames * (answer - moved).norm_squared();
+                    *sum += pending.weight * (answer - moved).norm_squared();
                 }
-                record.squared[WEIGHTED] += pending.frames * moved.norm_squared();
+                record.squared[WEIGHTED] += pending.weight * moved.norm_squared();
                 let e = said.fused - moved;
                 let missed = e.dot(&(said.information * e)) > REGION * self.ln_inflation.exp();
                 let step = WIDENING * pending.frames / BAND_KNOTS.len() as f64;
@@ -341,6 +362,7 @@ impl<C: Course> Adaptation<C> {
     fn weights(&self, hand: &C) -> [[f64; WEIGHTED]; BAND_KNOTS.len()] {
         let credit = self.credit();
         let moving = self.moving(hand);
+        let moving = moving + (1.0 - moving) * (-self.rested_s / REST_S).exp();
         let mut nearer: Option<[f64; WEIGHTED + 1]> = None;
         let mut out = [[0.0; WEIGHTED]; BAND_KNOTS.len()];
         for (band, weights) in out.iter_mut().enumerate() {

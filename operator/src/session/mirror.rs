@@ -43,6 +43,9 @@ const COPIES: u8 = 2;
 /// … and again when it is still not acknowledged after the round trip and this long, s.
 const PATIENCE_S: f64 = 0.15;
 
+/// A hand that is not moving when it engages has rested: the arm must not begin what the person has not begun, s.
+const RESTED_S: f64 = 10.0;
+
 /// A knot the robot may not have yet.
 struct Unacknowledged {
     knot: PathKnot,
@@ -82,13 +85,15 @@ impl Mirror {
                 gain,
                 skill.map(|skill| skill.predictor().calibration()),
                 skill.map_or(0.0, |skill| skill.stats().reach_m),
-            ),
+            )
+            .rested(RESTED_S),
             turns: Adaptation::of_turns(
                 gain,
                 skill
                     .and_then(Skill::turn)
                     .map(|turn| turn.predictor.model().calibration()),
-            ),
+            )
+            .rested(RESTED_S),
             without_model: false,
             newest: None,
             sent: None,

@@ -7,7 +7,7 @@ use super::params::WEIGHTED;
 use super::{BLOCK, KNOT_SPACING_S, MAX_KNOTS, Model, Posterior};
 
 /// The mixture's weight has halved where the novelty is this many times its 90 % quantile.
-const NOVELTY_MARGIN: f64 = 4.0;
+const NOVELTY_MARGIN: f64 = 6.0;
 
 /// The variance of the other experts grows with the motion, but for this share of it.
 const STILL_SHARE: f64 = 0.1;
