@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use crate::data::{data, needs};
-use nalgebra::{SMatrix, Vector3};
+use nalgebra::{Matrix3, SMatrix, Vector3};
 use telemime_operator::demonstration::Demonstration;
 use telemime_operator::learn::PredictorOptions;
 use telemime_operator::learn::predictor::{states, train, train_from_labels};
@@ -159,12 +159,26 @@ fn rounded(model: &Model) -> Model {
 #[derive(Default)]
 struct Scores {
     squared: BTreeMap<&'static str, Vec<f64>>,
+    /// At every knot the predictions judged, and those whose truth was within the region of 90 %.
+    judged: [[u32; 2]; 24],
 }
 
 impl Scores {
     fn add(&mut self, name: &'static str, knot: usize, error: Vector3<f64>) {
         let sums = self.squared.entry(name).or_insert_with(|| vec![0.0; 24]);
         sums[knot - 1] += error.norm_squared();
+    }
+
+    /// The best of what needs no model: standing still, going straight on, or half of that.
+    fn simple(&self, knot: usize) -> f64 {
+        let simple = ["hold", "cv", "half cv"].map(|name| self.ratio(name, knot));
+        simple.into_iter().fold(f64::INFINITY, f64::min)
+    }
+
+    /// The share of truths within the region that is to hold 90 %.
+    fn covered(&self, knot: usize) -> f64 {
+        let [judged, within] = self.judged[knot - 1];
+        f64::from(within) / f64::from(judged)
     }
 
     fn ratio(&self, name: &str, knot: usize) -> f64 {
@@ -228,18 +242,26 @@ fn score(model: &Model, reach_m: f64, test: &Demonstration, scores: &mut Scores)
         let sent = WireParams::quantise(&adaptation.params(&state)).dequantise();
         let fused = Forecast::fused(&state, &experts, &sent);
         let mixture = model.posterior(&state);
+        let (velocity, _) = state.motion();
         for j in 1..=model.knots() {
             let h_s = j as f64 * KNOT_SPACING_S;
             if sample.t_s + h_s > end_s {
                 break;
             }
             let truth = test.position_at(sample.t_s + h_s) - sample.position;
-            let [_, generic, straight] = experts.displacement[j - 1];
+            let knot = &fused.ahead.knots[j];
             scores.add("hold", j, truth);
             scores.add("gmr", j, mixture.displacement[j - 1] - truth);
-            scores.add("generic", j, generic - truth);
-            scores.add("straight", j, straight - truth);
-            scores.add("fused", j, fused.ahead.knots[j].displacement - truth);
+            scores.add("generic", j, experts.displacement[j - 1][1] - truth);
+            scores.add("cv", j, velocity * h_s - truth);
+            scores.add("half cv", j, velocity * (0.5 * h_s) - truth);
+            let error = knot.displacement - truth;
+            scores.add("fused", j, error);
+            let [xx, xy, xz, yy, yz, zz] = knot.covariance;
+            let covariance = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz);
+            let nees = error.dot(&(covariance.try_inverse().unwrap() * error));
+            scores.judged[j - 1][0] += 1;
+            scores.judged[j - 1][1] += u32::from(nees < 6.251);
         }
     }
 }
@@ -254,16 +276,20 @@ fn report(set: &str, scores: &Scores) {
     }
 }
 
-/// Ratios to hold at 100, 200 and 300 ms that the mixture must reach within 5 %, and those of the blend
-/// with the parameters that the training chose.
-fn must_reach(set: &str, mixture: [f64; 3], own: [f64; 3]) {
+/// The knots at which predictions are judged: 100, 200 and 300 ms.
+const JUDGED: [usize; 3] = [3, 6, 9];
+
+/// Ratios to hold at 100, 200 and 300 ms that the mixture must reach within 5 %, and those of what the session sends.
+/// Fused, the same prediction may not be worse than the best that needs no model by more than 5 %, and its region of 90 %
+/// holds 80 to 97 %.
+fn must_reach(set: &str, mixture: [f64; 3], fused: [f64; 3]) {
     let Some(folder) = needs(&format!("data/demos/{set}")) else {
         return;
     };
     let scores = evaluate(&by_person(&folder), 3);
     report(set, &scores);
-    for (name, bar) in [("gmr", mixture), ("own params", own)] {
-        for (knot, bar) in [3, 6, 9].into_iter().zip(bar) {
+    for (name, bar) in [("gmr", mixture), ("fused", fused)] {
+        for (knot, bar) in JUDGED.into_iter().zip(bar) {
             let ratio = scores.ratio(name, knot);
             assert!(
                 ratio < 1.05 * bar,
@@ -271,29 +297,118 @@ fn must_reach(set: &str, mixture: [f64; 3], own: [f64; 3]) {
             );
         }
     }
-}
-
-/// The figures are those of the numpy prototype, on the same split.
-#[test]
-#[allow(clippy::approx_constant, reason = "0.318 is a measured ratio")]
-fn gestures_are_predicted_as_well_as_by_the_prototype() {
-    for (set, prototype) in [
-        ("utd_mhad/a03_wave", [0.403, 0.373, 0.351]),
-        ("utd_mhad/a01_swipe_left", [0.393, 0.331, 0.285]),
-        ("utd_mhad/a09_circle_cw", [0.332, 0.318, 0.299]),
-        ("utd_mhad/a15_tennis_swing", [0.423, 0.393, 0.372]),
-        ("kard/a01_horizontal_arm_wave", [0.517, 0.504, 0.528]),
-    ] {
-        must_reach(set, prototype, prototype);
+    for knot in JUDGED {
+        let simple = scores.simple(knot);
+        let ratio = scores.ratio("fused", knot);
+        assert!(
+            ratio < 1.05 * simple,
+            "{set}, knot {knot}: {ratio:.3} against {simple:.3}"
+        );
+        let held = scores.covered(knot);
+        assert!(
+            (0.8..0.995).contains(&held),
+            "{set}, knot {knot}: {held:.3} of 0.9"
+        );
     }
 }
 
-/// Constant velocity beats the mixture here; the parameters chosen on held-out demonstrations must see it.
+/// The mixture's figures are those of the numpy prototype, on the same split. A clip begins where the hand does: what rests
+/// there is soon taken to rest, which costs what is fused the first moments.
+#[test]
+#[allow(clippy::approx_constant, reason = "0.318 is a measured ratio")]
+fn gestures_are_predicted_as_well_as_by_the_prototype() {
+    for (set, prototype, fused) in [
+        (
+            "utd_mhad/a03_wave",
+            [0.403, 0.373, 0.351],
+            [0.417, 0.397, 0.392],
+        ),
+        (
+            "utd_mhad/a01_swipe_left",
+            [0.393, 0.331, 0.285],
+            [0.406, 0.355, 0.321],
+        ),
+        (
+            "utd_mhad/a09_circle_cw",
+            [0.332, 0.318, 0.299],
+            [0.345, 0.343, 0.332],
+        ),
+        (
+            "utd_mhad/a15_tennis_swing",
+            [0.423, 0.393, 0.372],
+            [0.442, 0.422, 0.392],
+        ),
+        (
+            "kard/a01_horizontal_arm_wave",
+            [0.517, 0.504, 0.528],
+            [0.514, 0.518, 0.554],
+        ),
+    ] {
+        must_reach(set, prototype, fused);
+    }
+}
+
+/// A straight line beats the mixture here; together they beat both.
 #[test]
 fn a_slow_smooth_task_is_not_left_to_the_mixture() {
     must_reach(
         "robottasks/pouring",
         [0.14, 0.16, 0.18],
-        [0.073, 0.10, 0.13],
+        [0.067, 0.096, 0.122],
     );
+}
+
+/// Motion that was never demonstrated, of the same person or of another world.
+#[test]
+fn off_the_model_nothing_is_worse_than_standing_still_by_a_tenth() {
+    let sets = [
+        "utd_mhad/a03_wave",
+        "utd_mhad/a09_circle_cw",
+        "robottasks/pouring",
+        "helloworld/e",
+        "kard/a01_horizontal_arm_wave",
+    ];
+    let mut groups = Vec::new();
+    for set in sets {
+        let Some(folder) = needs(&format!("data/demos/{set}")) else {
+            return;
+        };
+        groups.push((set, by_person(&folder)));
+    }
+    let mut all = Scores::default();
+    for (learned, people) in &groups {
+        let mut taught = people[0].clone();
+        taught.truncate(3);
+        let model = train(&taught, &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
+        for (set, people) in groups.iter().filter(|(set, _)| set != learned) {
+            let mut together = Scores::default();
+            for test in people[0].iter().take(2) {
+                let mut one = Scores::default();
+                for scores in [&mut one, &mut together, &mut all] {
+                    score(&model, reach_m(&taught), test, scores);
+                }
+                for knot in JUDGED {
+                    let ratio = one.ratio("fused", knot);
+                    assert!(
+                        ratio < 1.1,
+                        "{learned} on {}, knot {knot}: {ratio:.3}",
+                        test.name()
+                    );
+                }
+            }
+            for knot in JUDGED {
+                let (ratio, simple) = (together.ratio("fused", knot), together.simple(knot));
+                println!("{learned} on {set}, knot {knot}: {ratio:.3}, best simple {simple:.3}");
+                assert!(
+                    ratio < 1.3 * simple,
+                    "{learned} on {set}: {ratio:.3}, {simple:.3}"
+                );
+            }
+        }
+    }
+    for knot in JUDGED {
+        let held = all.covered(knot);
+        println!("knot {knot}: {held:.3} within the region of 0.9");
+        assert!(held > 0.8, "knot {knot}: {held:.3}");
+    }
 }
