@@ -344,6 +344,7 @@ fn a_path_that_no_datagram_delivers_goes_by_the_stream_to_its_last_sample() {
     const BOUND_M: f64 = 0.002;
     let config = SessionConfig {
         path_bound_m: Some(BOUND_M),
+        glitch_gate: false,
         ..bound(0.05)
     };
     let grid = PathGrid::for_bound(BOUND_M).unwrap();
