@@ -30,7 +30,7 @@ pub use config::{FutureBound, HandSample, SessionConfig, default_scale};
 pub use said::{Counters, Event, Output};
 
 use gate::{Gate, Taken};
-use hand::Hand;
+use hand::{Hand, Interval};
 use mirror::Mirror;
 
 /// While an emergency stop is not confirmed, it is repeated at this interval, s.
@@ -64,6 +64,7 @@ pub struct Session {
     changes: u32,
     hand: Option<Hand>,
     gate: Gate,
+    interval: Interval,
     recogniser: Option<Recogniser>,
     verdict: Option<Verdict>,
     activity: Activity,
@@ -97,6 +98,7 @@ impl Session {
             changes: 0,
             hand: None,
             gate: Gate::default(),
+            interval: Interval::default(),
             recogniser: None,
             verdict: None,
             activity: Activity::Nothing,
@@ -173,6 +175,7 @@ impl Session {
             self.hand = Hand::first(&sample);
             return;
         };
+        let previous = *hand;
         let suspects = self.gate.suspects() as u32;
         let taken = if self.config.glitch_gate {
             let skill = self.skill.as_deref();
@@ -190,6 +193,8 @@ impl Session {
             return;
         };
         let hand = *hand;
+        self.interval
+            .take(hand.place.t.secs_since(previous.place.t));
         self.recognise(&hand);
         let network_s = self.network_delay_s();
         let Activity::Mirror(mirror) = &mut self.activity else {
@@ -262,7 +267,8 @@ impl Session {
             return;
         };
         let skill = self.skill.as_deref().filter(|_| self.model_stored);
-        let Ok(mirror) = Mirror::new(hand, self.path_bound_m(), self.config.gain, skill) else {
+        let path = (self.path_bound_m(), self.interval.us());
+        let Ok(mirror) = Mirror::new(hand, path, self.config.gain, skill) else {
             self.events.push_back(Event::Refused(Refusal::BadMapping));
             return;
         };
@@ -476,6 +482,7 @@ impl Session {
                 rotation.k as f32,
             ],
             path_bound_um: (self.path_bound_m() * 1e6).round() as u32,
+            sample_us: self.interval.us(),
             lease_ms: (self.config.lease_s * 1e3) as u16,
         };
         self.control(&OperatorControl::Engage(engage));

@@ -2,9 +2,6 @@
 
 use super::*;
 use nalgebra::UnitQuaternion;
-use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid};
-use telemime_protocol::wire::knots;
-use telemime_protocol::wire::v1::PathTail;
 
 /// Where the newest motion says the hand is.
 fn said(bench: &Bench) -> Vector3<f64> {
@@ -58,22 +55,6 @@ fn one_or_two_stray_samples_never_leave_and_a_third_is_what_the_hand_does() {
     }
 }
 
-/// The path as the stream carries it at the release.
-fn path(bench: &mut Bench) -> PathDecoder {
-    bench.session.release();
-    bench.drain();
-    let grid = PathGrid::for_bound(1e-3).unwrap();
-    let mut path = PathDecoder::new(grid, 4096);
-    for message in &bench.control {
-        if let OperatorControl::Path(PathTail { state, knots, .. }) = message {
-            for knot in knots::unpack(state, grid, knots) {
-                path.append(&knot).unwrap();
-            }
-        }
-    }
-    path
-}
-
 #[test]
 fn the_path_waits_for_the_truth() {
     for running in [2, 3] {
@@ -88,7 +69,9 @@ fn the_path_waits_for_the_truth() {
             bench.sample(to(i));
             seen.push((bench.now, to(i)));
         }
-        let path = path(&mut bench);
+        bench.session.release();
+        bench.drain();
+        let path = super::mirroring::by_stream(&bench.control, 1e-3);
         for (i, (t, x)) in seen.iter().enumerate() {
             let glitch = running == 2 && i < 2;
             let off_m = (path.eval(*t).unwrap().x - x).norm();
@@ -149,8 +132,6 @@ fn latency_makes_samples_older_and_horizons_longer_and_counts_once() {
     bench.receives(&RobotDatagram::Telemetry(telemetry(1, 0)));
     assert!((bench.session.delay_s - 0.1).abs() < 1e-12);
     assert!((bench.session.network_delay_s() - 0.04).abs() < 1e-12);
-    let grid_us = |m: &Motion| m.knots.len();
-    assert!(bench.motions().iter().map(grid_us).sum::<usize>() > 0);
 }
 
 #[test]
