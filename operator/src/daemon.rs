@@ -251,7 +251,7 @@ impl Daemon {
             let _ = notices.send(Notice::Connected { epoch: link.epoch });
             let mut session = Session::new(self.config, lessons.skill(), link.epoch)
                 .watched_by(self.recogniser.clone());
-            (marks.requests, marks.told_after) = (0, None);
+            marks.requests = 0;
             if stop {
                 session.stop(self.now());
             }
@@ -412,25 +412,25 @@ impl Daemon {
                 let _ = notices.send(Notice::Event(now, event));
             }
             let advice = task.advise(now, session);
-            if advice == Advice::Between {
-                if marks.performed(session.requests()) {
-                    let zero = task.zero().unwrap_or(now);
-                    let _ = notices.send(Notice::Performed {
-                        number: marks.performances,
-                        zero: zero.offset_by_secs(-self.config.input_latency_s),
-                    });
-                    if self.learning.refine {
-                        let taken = lessons.keep(session.driven());
-                        match taken.and_then(|name| lessons.refine(true).map(|()| name)) {
-                            Ok(name) => drop(notices.send(Notice::Kept(name))),
-                            Err(e) => console.note(e.to_string()),
-                        }
+            if advice == Advice::Performed {
+                marks.performances += 1;
+                let zero = task.zero().unwrap_or(now);
+                let _ = notices.send(Notice::Performed {
+                    number: marks.performances,
+                    zero: zero.offset_by_secs(-self.config.input_latency_s),
+                });
+                if self.learning.refine {
+                    let taken = lessons.keep(session.driven());
+                    match taken.and_then(|name| lessons.refine(true).map(|()| name)) {
+                        Ok(name) => drop(notices.send(Notice::Kept(name))),
+                        Err(e) => console.note(e.to_string()),
                     }
                 }
-                if !lessons.is_busy() && session.is_ready() {
-                    task.go_on();
-                    continue;
-                }
+            }
+            let between = matches!(advice, Advice::Performed | Advice::Between);
+            if between && !lessons.is_busy() && (session.is_ready() || task.is_in_trouble()) {
+                task.go_on();
+                continue;
             }
             // Whoever says stop is not left before the robot says it has.
             if advice == Advice::Finished && !session.stop_is_unconfirmed() {
@@ -607,20 +607,9 @@ struct Marks {
     released: Option<Counts>,
     progress: f64,
     performances: u32,
-    told_after: Option<u32>,
 }
 
 impl Marks {
-    /// A performance is over; true once for each, as there were so many requests until then.
-    fn performed(&mut self, requests: u32) -> bool {
-        let fresh = self.told_after != Some(requests);
-        if fresh {
-            self.told_after = Some(requests);
-            self.performances += 1;
-        }
-        fresh
-    }
-
     /// Before anything that follows the newest request is handed to QUIC.
     fn on_request(&mut self, requests: u32, counts: Counts) {
         if self.requests != requests {

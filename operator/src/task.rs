@@ -32,7 +32,9 @@ pub enum Outcome {
 pub enum Advice {
     /// Go on.
     Continue,
-    /// A performance is over and another may follow: [`Task::go_on`] when it may.
+    /// A performance is over; said once.
+    Performed,
+    /// Another may follow: [`Task::go_on`] when it may.
     Between,
     /// The task is over: leave.
     Finished,
@@ -204,7 +206,7 @@ impl Task {
                 let performed = matches!(self.work, Work::Replay { .. }) && self.trouble.is_none();
                 if performed {
                     self.phase = Phase::Between;
-                    return Advice::Between;
+                    return Advice::Performed;
                 }
                 self.phase = Phase::Over;
                 return Advice::Finished;
@@ -248,12 +250,18 @@ impl Task {
         Advice::Continue
     }
 
+    /// Whether something happened after which nothing more is driven.
+    pub fn is_in_trouble(&self) -> bool {
+        self.trouble.is_some()
+    }
+
     /// After [`Advice::Between`]: begins the next performance, or ends the task if there is none.
     pub fn go_on(&mut self) {
         if self.phase != Phase::Between {
             return;
         }
-        self.phase = match self.then.pop_front() {
+        let next = self.then.pop_front().filter(|_| self.trouble.is_none());
+        self.phase = match next {
             None => Phase::Over,
             Some(recording) => {
                 self.work = Work::Replay { recording, next: 0 };
