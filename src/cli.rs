@@ -150,7 +150,7 @@ fn link(args: &LinkArgs) -> anyhow::Result<()> {
         .build()?;
     let (mut passed, mut lost) = (0u64, 0u64);
     let result = runtime.block_on(async {
-        let (quit, _words) = shell::listen(false, || {})?;
+        let (quit, _words) = shell::listen(false, "quit", || {})?;
         let config = RelayConfig {
             listen: args.listen,
             to: args.to,
