@@ -44,6 +44,9 @@ const COPIES: u8 = 2;
 /// … and again when it is still not acknowledged after the round trip and this long, s.
 const PATIENCE_S: f64 = 0.15;
 
+/// A hand that is not moving when it engages has rested: the arm must not begin what the person has not begun, s.
+const RESTED_S: f64 = 10.0;
+
 /// What is kept of an engagement, in samples: half an hour of a tracker of 60 Hz. What comes later is not.
 const MOST_DRIVEN: usize = 108_000;
 
@@ -115,15 +118,17 @@ impl Mirror {
             first_unacknowledged: 0,
             places: Adaptation::of_places(
                 gain,
-                skill.map(|skill| skill.predictor().calibration().params),
+                skill.map(|skill| skill.predictor().calibration()),
                 skill.map_or(0.0, |skill| skill.stats().reach_m),
-            ),
+            )
+            .rested(RESTED_S),
             turns: Adaptation::of_turns(
                 gain,
                 skill
                     .and_then(Skill::turn)
-                    .map(|turn| turn.predictor.model().calibration().params),
-            ),
+                    .map(|turn| turn.predictor.model().calibration()),
+            )
+            .rested(RESTED_S),
             without_model: false,
             newest: None,
             sent: None,
@@ -177,8 +182,7 @@ impl Mirror {
         std::mem::take(&mut self.driven)
     }
 
-    /// Takes the newest hand state, which `sample` led to as `taken` says; `horizon_s` is how far ahead the robot
-    /// will have to look. Returns how many knots were made.
+    /// Takes the newest hand state, which `sample` led to as `taken` says. Returns how many knots were made.
     ///
     /// The future is urgent and believes the gate at once. The path is complete, and adaptation wants the truth:
     /// both wait until it is known what a replaced sample was.
@@ -188,7 +192,6 @@ impl Mirror {
         taken: Taken,
         hand: Hand,
         skill: Option<&Skill>,
-        horizon_s: f64,
     ) -> u32 {
         self.hand = hand;
         if taken == Taken::Replaced {
@@ -203,11 +206,10 @@ impl Mirror {
         let previous = std::mem::replace(&mut self.judged, hand);
         let skill = skill.filter(|_| !self.without_model);
         let model = skill.map(Skill::predictor);
-        self.places
-            .observe(&previous.place, &hand.place, model, horizon_s);
+        self.places.observe(&previous.place, &hand.place, model);
         if let (Some(previous), Some(turn)) = (&previous.turn, &hand.turn) {
             let model = skill.and_then(Skill::turn).map(|turn| &turn.predictor);
-            self.turns.observe(previous, turn, model, horizon_s);
+            self.turns.observe(previous, turn, model);
         }
         self.newest = self.travelling().map(|t| t.known(skill));
         let knots = self.settle(taken == Taken::Rewritten);
