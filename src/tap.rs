@@ -118,7 +118,10 @@ fn times(path: &Path) -> anyhow::Result<Vec<f64>> {
             continue;
         }
         let time = line.parse::<f64>().with_context(|| {
-            format!("{}, line {number}: `{line}` is not a time in s", path.display())
+            format!(
+                "{}, line {number}: `{line}` is not a time in s",
+                path.display()
+            )
         })?;
         times.push(time);
     }
@@ -141,7 +144,11 @@ fn live(count: usize) -> anyhow::Result<(Samples, Vec<f64>)> {
     let samples = tx.clone();
     // Threads of their own, never joined: a blocking read cannot be cancelled, and ends with the process.
     thread::Builder::new().spawn(move || {
-        for line in std::io::stdin().lock().lines().map_while(std::result::Result::ok) {
+        for line in std::io::stdin()
+            .lock()
+            .lines()
+            .map_while(std::result::Result::ok)
+        {
             let what = position(&line).map_or(Heard::Other(line), Heard::Sample);
             if samples.send((clock.now(), what)).is_err() {
                 return;
@@ -202,7 +209,10 @@ mod tests {
             position("12.5, 0.1,-0.2,2"),
             Some(Vector3::new(0.1, -0.2, 2.0))
         );
-        assert_eq!(position("1,2,3,4,1,0,0,0"), Some(Vector3::new(2.0, 3.0, 4.0)));
+        assert_eq!(
+            position("1,2,3,4,1,0,0,0"),
+            Some(Vector3::new(2.0, 3.0, 4.0))
+        );
         for line in ["t,x,y,z", "", "1,2,3", "1,2,3,nan", "1,2,3,x"] {
             assert_eq!(position(line), None, "{line}");
         }

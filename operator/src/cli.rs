@@ -291,7 +291,11 @@ impl Args {
             // As on the command line: there is nothing to refine by what is only played.
             self.refine |= file.refine.unwrap_or(false) && self.play.is_none();
         }
-        if let Some(ms) = file.input.latency_ms.filter(|_| self.input_latency.is_none()) {
+        if let Some(ms) = file
+            .input
+            .latency_ms
+            .filter(|_| self.input_latency.is_none())
+        {
             let latency = parse_latency(&format!("{ms}ms"));
             let latency = latency
                 .map_err(|e| anyhow::anyhow!("{}: [input] latency_ms = {e}", path.display()))?;

@@ -1,7 +1,7 @@
 //! The operator's shell: dials, redials, feeds the session samples and moves its bytes.
 
-use std::future::Future;
 use std::borrow::Cow;
+use std::future::Future;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::pin::pin;

@@ -133,13 +133,13 @@ impl Task {
         self.phase == Phase::Over
             || self.then.is_empty()
                 && match &self.work {
-                Work::Replay { recording, .. } => {
-                    let end_s = recording.samples.last().map_or(0.0, |s| s.t_s);
-                    self.zero()
-                        .is_some_and(|zero| now.secs_since(zero) > end_s + LEAVE_S)
+                    Work::Replay { recording, .. } => {
+                        let end_s = recording.samples.last().map_or(0.0, |s| s.t_s);
+                        self.zero()
+                            .is_some_and(|zero| now.secs_since(zero) > end_s + LEAVE_S)
+                    }
+                    Work::Play { .. } => self.trouble.is_some(),
                 }
-                Work::Play { .. } => self.trouble.is_some(),
-            }
     }
 
     /// Whether the clutch has been let go after an engagement.

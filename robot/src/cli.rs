@@ -230,7 +230,9 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let (rings, handle) = servo::rings();
     let running = servo::thread::Servo::start(rig.servo(rings)).context("no servo thread")?;
     let brake = handle.brake.clone();
-    let (quit, words) = cli::listen(args.follow_stdin, cli::ROBOT_WORDS, move || brake.stop_here())?;
+    let (quit, words) = cli::listen(args.follow_stdin, cli::ROBOT_WORDS, move || {
+        brake.stop_here()
+    })?;
     let (out, printing) = Printer::start().context("no thread to print from")?;
     let log = Log {
         json: args.json,

@@ -96,7 +96,10 @@ fn feed(skill: &Arc<Skill>, seen: &Seen, truth: &Seen, glitch_gate: bool, errors
         session.handle_timeout(at(*t_s + 0.2));
         let mut newest = None;
         while let Some(output) = session.poll_output() {
-            if let Output::Datagram { bytes, motion: true } = output
+            if let Output::Datagram {
+                bytes,
+                motion: true,
+            } = output
                 && let OperatorDatagram::Motion(motion) = OperatorDatagram::decode(&bytes).unwrap()
             {
                 newest = Some(motion);
@@ -181,7 +184,12 @@ fn a_generated_hand_keeps_its_prediction_through_glitches() {
 #[test]
 fn real_gestures_keep_their_prediction_through_glitches() {
     let mut cases = Vec::new();
-    for gesture in ["a01_swipe_left", "a03_wave", "a09_circle_cw", "a15_tennis_swing"] {
+    for gesture in [
+        "a01_swipe_left",
+        "a03_wave",
+        "a09_circle_cw",
+        "a15_tennis_swing",
+    ] {
         let Some(folder) = needs(&format!("data/demos/utd_mhad/{gesture}")) else {
             return;
         };

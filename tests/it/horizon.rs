@@ -63,9 +63,7 @@ fn drive(
             let time_s = |r: &Report| r.at.secs_since(zero);
             let from_s = (own[0].engaged_at.secs_since(zero) + RAMP_S).max(0.0);
             let end_s = performances[number as usize - 1].last().unwrap().0;
-            let judged = own
-                .iter()
-                .filter(|r| (from_s..end_s).contains(&time_s(r)));
+            let judged = own.iter().filter(|r| (from_s..end_s).contains(&time_s(r)));
             let point = |r: &&Report| (time_s(r), r.mapping.unplace(r.tip_m));
             Performed {
                 jerk_m_s3: rms(judged.map(|r| r.jerk_m_s3)),
@@ -217,12 +215,24 @@ fn a_session_learns_from_what_it_drives() {
         let told: Vec<_> = told.collect();
         assert_eq!(told.len(), 3, "after every performance");
         let sources = |skill: &Skill| skill.parts().provenance.sources.len();
-        assert!(told.iter().zip(6..).all(|((s, n), all)| *n == 1 && sources(s) == all));
+        assert!(
+            told.iter()
+                .zip(6..)
+                .all(|((s, n), all)| *n == 1 && sources(s) == all)
+        );
         let saved = telemime_operator::skill_file::load(folder.path().join("swing.skill")).unwrap();
         assert_eq!(saved.id(), told[2].0.id(), "the last one is what is saved");
-        assert!(!as_is.notices.iter().any(|n| matches!(n, Notice::Refined { .. })));
+        assert!(
+            !as_is
+                .notices
+                .iter()
+                .any(|n| matches!(n, Notice::Refined { .. }))
+        );
     }
     println!("another person, m: skill as it was {fixed:.4?}, refined {learned:.4?}");
-    assert!((fixed[0] - learned[0]).abs() < 1e-9, "the first is the same");
+    assert!(
+        (fixed[0] - learned[0]).abs() < 1e-9,
+        "the first is the same"
+    );
     assert!(learned[1] < fixed[1] && learned[2] < fixed[2]);
 }

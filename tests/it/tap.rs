@@ -31,7 +31,11 @@ fn every_tap_is_found_and_when_it_was() {
     for seed in 0..20 {
         let (samples, touched) = tapped(seed, 0.0, 0.0);
         let found = stops(&samples);
-        assert_eq!(found.len(), touched.len(), "seed {seed}: {found:.3?} {touched:.3?}");
+        assert_eq!(
+            found.len(),
+            touched.len(),
+            "seed {seed}: {found:.3?} {touched:.3?}"
+        );
         for (a, b) in found.iter().zip(&touched) {
             worst = worst.max((a - b).abs());
         }
@@ -52,10 +56,16 @@ fn a_known_latency_is_found_within_its_own_bound() {
             within += u32::from(off_s <= found.bound_s);
             worst = worst.max(off_s);
             assert!(found.used >= 8 && found.taps == 12, "{found:?}");
-            assert!(off_s < 0.003 + jitter_s, "{late_s} s, {jitter_s} s: {found:?}");
+            assert!(
+                off_s < 0.003 + jitter_s,
+                "{late_s} s, {jitter_s} s: {found:?}"
+            );
         }
     }
-    println!("{within} of {all} within their bound; worst {:.1} ms off", worst * 1e3);
+    println!(
+        "{within} of {all} within their bound; worst {:.1} ms off",
+        worst * 1e3
+    );
     assert!(10 * within >= 9 * all, "{within} of {all}");
 }
 
@@ -75,7 +85,10 @@ fn taps_missed_and_presses_forgotten_do_not_count() {
 fn what_says_nothing_is_refused_and_says_why() {
     let (samples, pressed) = tapped(5, 0.05, 0.0);
     let refused = |samples: &Samples, pressed: &[f64]| latency(samples, pressed).unwrap_err();
-    assert_eq!(refused(&samples, &pressed[..4]), TapError::FewTaps { taps: 4 });
+    assert_eq!(
+        refused(&samples, &pressed[..4]),
+        TapError::FewTaps { taps: 4 }
+    );
     let mut backwards = pressed.clone();
     backwards.swap(3, 4);
     assert!(matches!(
@@ -88,13 +101,25 @@ fn what_says_nothing_is_refused_and_says_why() {
         TapError::Unordered { number: 1, .. }
     ));
     // A hand that waves does not stop abruptly.
-    let waves = swing(3, 0).into_iter().map(|(t, x)| (t, x.into())).collect();
-    assert!(matches!(refused(&waves, &pressed), TapError::FewStops { .. }));
-    assert!(matches!(refused(&Vec::new(), &pressed), TapError::FewStops { stops: 0 }));
+    let waves = swing(3, 0)
+        .into_iter()
+        .map(|(t, x)| (t, x.into()))
+        .collect();
+    assert!(matches!(
+        refused(&waves, &pressed),
+        TapError::FewStops { .. }
+    ));
+    assert!(matches!(
+        refused(&Vec::new(), &pressed),
+        TapError::FewStops { stops: 0 }
+    ));
     // Another clock.
     let elsewhere: Vec<f64> = pressed.iter().map(|t| t + 1000.0).collect();
     let error = refused(&samples, &elsewhere);
-    assert!(matches!(error, TapError::Unmatched { matched: 0, .. }), "{error}");
+    assert!(
+        matches!(error, TapError::Unmatched { matched: 0, .. }),
+        "{error}"
+    );
     // Pressed at random.
     let random: Vec<f64> = (0..12).map(|i| 0.31 + 1.37 * f64::from(i)).collect();
     let error = refused(&samples, &random);

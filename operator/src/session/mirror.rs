@@ -50,14 +50,6 @@ const RESTED_S: f64 = 10.0;
 /// What is kept of an engagement, in samples: half an hour of a tracker of 60 Hz. What comes later is not.
 const MOST_DRIVEN: usize = 108_000;
 
-/// By what a hand is predicted before there is a mirror: as it was calibrated, place and orientation.
-pub(super) fn calibrated(skill: Option<&Skill>) -> (Params, Params) {
-    let place = skill.map(|skill| skill.predictor().calibration().params);
-    let turn = skill.and_then(Skill::turn);
-    let turn = turn.map(|turn| turn.predictor.model().calibration().params);
-    (place.unwrap_or_default(), turn.unwrap_or_default())
-}
-
 /// A sample that its prediction stands for, for the time being.
 struct Suspect {
     seen: HandSample,

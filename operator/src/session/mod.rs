@@ -17,6 +17,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use telemime_protocol::checkpoint::PosePlan;
+use telemime_protocol::predict::Params;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::codec;
@@ -181,10 +182,9 @@ impl Session {
             let skill = self.skill.as_deref();
             let params = match &self.activity {
                 Activity::Mirror(mirror) => mirror.params(),
-                Activity::Nothing | Activity::Play { .. } => mirror::calibrated(skill),
+                Activity::Nothing | Activity::Play { .. } => (Params::DEFAULT, Params::DEFAULT),
             };
-            self.gate
-                .take(hand, &sample, skill, (&params.0, &params.1))
+            self.gate.take(hand, &sample, skill, (&params.0, &params.1))
         } else {
             hand.advance(&sample).then_some(Taken::Real)
         };

@@ -20,7 +20,12 @@ const STRAY_M: std::ops::Range<f64> = 0.25..0.6;
 /// assert_eq!(seen.len(), swing.len());
 /// assert!(seen.iter().zip(&swing).zip(&wrong).all(|((a, b), &wrong)| wrong != (a == b)));
 /// ```
-pub fn glitched(samples: &[Frame], share: f64, running: usize, seed: u64) -> (Vec<Frame>, Vec<bool>) {
+pub fn glitched(
+    samples: &[Frame],
+    share: f64,
+    running: usize,
+    seed: u64,
+) -> (Vec<Frame>, Vec<bool>) {
     let mut rng = stream(seed ^ GLITCH_STREAM, 0);
     let mut seen = samples.to_vec();
     let mut wrong = vec![false; samples.len()];
@@ -32,7 +37,12 @@ pub fn glitched(samples: &[Frame], share: f64, running: usize, seed: u64) -> (Ve
             continue;
         }
         let direction: [f64; 3] = core::array::from_fn(|_| normal(&mut rng));
-        let norm = direction.iter().map(|d| d * d).sum::<f64>().sqrt().max(1e-9);
+        let norm = direction
+            .iter()
+            .map(|d| d * d)
+            .sum::<f64>()
+            .sqrt()
+            .max(1e-9);
         let far_m = rng.random_range(STRAY_M);
         for j in i..i + running {
             for (x, d) in seen[j].1.iter_mut().zip(direction) {

@@ -50,7 +50,10 @@ fn one_or_two_stray_samples_never_leave_and_a_third_is_what_the_hand_does() {
         let mut off = Bench::engaged(telling(false), None);
         off.sample(along(0));
         off.sample(along(1) + STRAY);
-        assert!((said(&off) - along(1) - STRAY).norm() < 1e-3, "switched off");
+        assert!(
+            (said(&off) - along(1) - STRAY).norm() < 1e-3,
+            "switched off"
+        );
         assert_eq!(off.session.counters().glitches, 0);
     }
 }
@@ -99,7 +102,11 @@ fn a_wrist_that_flips_for_a_frame_does_not_turn_the_tool() {
     (0..20).for_each(|i| drop(sample(&mut bench, i, 0.01 * f64::from(i))));
     sample(&mut bench, 20, 3.0);
     let told = sample(&mut bench, 21, 0.21).dequantise(Stamp::ZERO);
-    assert!(told.q.angle_to(&UnitQuaternion::from_euler_angles(0.0, 0.0, 0.21)) < 0.02);
+    assert!(
+        told.q
+            .angle_to(&UnitQuaternion::from_euler_angles(0.0, 0.0, 0.21))
+            < 0.02
+    );
     assert_eq!(bench.session.counters().glitches, 1);
 }
 
@@ -174,8 +181,11 @@ fn a_new_skill_waits_until_nothing_is_driven() {
     assert!(bench.control.is_empty(), "not while the arm follows");
     bench.session.release();
     bench.drain();
-    let [.., OperatorControl::Release { .. }, OperatorControl::Model { id: sent, .. }] =
-        &bench.control[..]
+    let [
+        ..,
+        OperatorControl::Release { .. },
+        OperatorControl::Model { id: sent, .. },
+    ] = &bench.control[..]
     else {
         panic!("{:?}", bench.control)
     };
@@ -188,5 +198,7 @@ fn a_new_skill_waits_until_nothing_is_driven() {
     let newest = Arc::new(old);
     bench.session.replace_skill(Arc::clone(&newest));
     bench.drain();
-    assert!(matches!(&bench.control[..], [OperatorControl::Model { id, .. }] if *id == newest.id().0));
+    assert!(
+        matches!(&bench.control[..], [OperatorControl::Model { id, .. }] if *id == newest.id().0)
+    );
 }
