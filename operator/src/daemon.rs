@@ -421,7 +421,7 @@ impl Daemon {
                 });
                 if self.learning.refine {
                     let taken = lessons.keep(session.driven());
-                    match taken.and_then(|name| lessons.refine(true).map(|()| name)) {
+                    match taken.and_then(|name| lessons.refine().map(|()| name)) {
                         Ok(name) => drop(notices.send(Notice::Kept(name))),
                         Err(e) => console.note(e.to_string()),
                     }
@@ -503,7 +503,7 @@ impl Daemon {
             Word::Keep => {
                 let _ = notices.send(Notice::Kept(lessons.keep(session.driven())?));
             }
-            Word::Refine => lessons.refine(false)?,
+            Word::Refine => lessons.refine()?,
             Word::Save(file) => {
                 lessons.save(file)?;
                 let _ = notices.send(Notice::Saved(file.clone()));

@@ -103,12 +103,11 @@ impl Lessons {
         Ok(name)
     }
 
-    /// Begins to refine the skill with what was kept. With `alike`, performances that look like another gesture
-    /// are left out.
+    /// Begins to refine the skill with what was kept.
     ///
     /// # Errors
     /// [`LessonError`]: there is no skill, nothing was kept, or it is being refined already.
-    pub fn refine(&mut self, alike: bool) -> Result<(), LessonError> {
+    pub fn refine(&mut self) -> Result<(), LessonError> {
         let skill = self.skill.clone().ok_or(LessonError::NoSkill)?;
         if self.is_busy() {
             return Err(LessonError::Busy);
@@ -118,7 +117,7 @@ impl Lessons {
         }
         let kept = std::mem::take(&mut self.kept);
         self.work = Some(tokio::task::spawn_blocking(move || {
-            learn_from(&skill, &kept, alike)
+            learn_from(&skill, &kept)
         }));
         Ok(())
     }
@@ -164,17 +163,12 @@ impl Lessons {
     }
 }
 
-fn learn_from(skill: &Arc<Skill>, kept: &[Demonstration], alike: bool) -> Lesson {
+fn learn_from(skill: &Arc<Skill>, kept: &[Demonstration]) -> Lesson {
     let mut newest: Option<Skill> = None;
     let (mut learned, mut left_out) = (Vec::new(), Vec::new());
     for performance in kept {
         let from = newest.as_ref().unwrap_or(skill);
         match refine(from, performance) {
-            Ok((_, what)) if alike && what.is_unlike() => {
-                let novel = what.novel * 1e2;
-                let why = format!("it looks like another gesture: {novel:.0} % of it is new");
-                left_out.push((what.name, why));
-            }
             Ok((refined, what)) => {
                 newest = Some(refined);
                 learned.push(what);

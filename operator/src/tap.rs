@@ -25,7 +25,7 @@ const STILL_S: f64 = 0.1;
 const TOGETHER_S: f64 = 0.04;
 
 /// A larger deviation of single taps is no measurement, s.
-const WIDEST_S: f64 = 0.03;
+const WIDEST_S: f64 = 0.04;
 
 /// From the median absolute deviation of a normal distribution to its standard deviation.
 const MAD: f64 = 1.4826;

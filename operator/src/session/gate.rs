@@ -19,6 +19,9 @@ const SIGMAS: f64 = 3.0;
 const SENSOR_M: f64 = 0.01;
 const SENSOR_RAD: f64 = 0.1;
 
+/// Nor is what the demonstrated speed (95 % of the time not exceeded) covers this many times between two samples: a hand may begin, or turn back.
+const SPEED: f64 = 1.5;
+
 /// After a hole this long nothing is foretold well enough to judge by, s.
 const HOLE_S: f64 = 0.25;
 
@@ -105,7 +108,8 @@ fn foretold(
     };
     let there = forecast.at(ahead_s);
     let most = |sigma: f64, floor: f64| SIGMAS * (3.0 * sigma * sigma + floor * floor).sqrt();
-    let strayed = (sample.x - there.position).norm() > most(there.sigma_m, SENSOR_M);
+    let usual_m = skill.map_or(0.0, |skill| SPEED * skill.stats().speed95_m_s * ahead_s);
+    let strayed = (sample.x - there.position).norm() > most(there.sigma_m, SENSOR_M).max(usual_m);
     let turned = hand.turn.zip(sample.orientation).and_then(|(state, seen)| {
         let forecast = match skill.and_then(Skill::turn) {
             Some(turned) => turned.predictor.forecast(&state, turn),
