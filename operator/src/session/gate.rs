@@ -22,6 +22,9 @@ const SENSOR_RAD: f64 = 0.1;
 /// Nor is what the demonstrated speed (95 % of the time not exceeded) covers this many times between two samples: a hand may begin, or turn back.
 const SPEED: f64 = 1.5;
 
+/// The speed of a hand of which nothing was demonstrated, m/s: 95 % of a wave's are below.
+const UNKNOWN_M_S: f64 = 4.0;
+
 /// After a hole this long nothing is foretold well enough to judge by, s.
 const HOLE_S: f64 = 0.25;
 
@@ -108,7 +111,8 @@ fn foretold(
     };
     let there = forecast.at(ahead_s);
     let most = |sigma: f64, floor: f64| SIGMAS * (3.0 * sigma * sigma + floor * floor).sqrt();
-    let usual_m = skill.map_or(0.0, |skill| SPEED * skill.stats().speed95_m_s * ahead_s);
+    let usual_m_s = skill.map_or(UNKNOWN_M_S, |skill| skill.stats().speed95_m_s);
+    let usual_m = SPEED * usual_m_s * ahead_s;
     let strayed = (sample.x - there.position).norm() > most(there.sigma_m, SENSOR_M).max(usual_m);
     let turned = hand.turn.zip(sample.orientation).and_then(|(state, seen)| {
         let forecast = match skill.and_then(Skill::turn) {

@@ -23,6 +23,7 @@ fn a_request_carries_the_hand_and_the_mapping() {
         rotation: UnitQuaternion::from_euler_angles(0.1, 0.2, 0.3),
         path_bound_m: Some(0.0123),
         scale: Some(0.2),
+        glitch_gate: false,
         ..SessionConfig::default()
     };
     let skill = example(2, 24);
