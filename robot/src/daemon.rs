@@ -159,6 +159,8 @@ impl Daemon {
                 Some(word) = words.recv() => match word {
                     Word::Stop => self.servo.brake.stop_here(),
                     Word::Reset => self.order(Order::Reset { operator: active.is_some(), stop: None }),
+                    // What an operator says; a robot's terminal does not know them.
+                    Word::Keep | Word::Refine | Word::Save(_) => {}
                 },
                 _ = drain.tick() => {
                     self.drain(active.as_mut(), &notices);

@@ -11,7 +11,7 @@ use telemime_endpoint::cli::Word;
 use telemime_endpoint::quic::EndpointError;
 use telemime_endpoint::{HostClock, Identity, IdentityError, Meter, Mono, quic};
 use telemime_operator::daemon::{
-    Daemon as OperatorDaemon, DaemonError, Notice as OperatorNotice, Summary,
+    Daemon as OperatorDaemon, DaemonError, Learning, Notice as OperatorNotice, Summary,
 };
 use telemime_operator::session::SessionConfig;
 use telemime_operator::task::Task;
@@ -72,6 +72,8 @@ pub struct Pair {
     robot_identity: Identity,
     operator_identity: Identity,
     operators: u8,
+    /// What operators started from now on learn from while driving.
+    pub learning: Learning,
 }
 
 /// The robot of a [`Pair`]: what it reports, tick by tick.
@@ -194,6 +196,7 @@ impl Pair {
             robot_identity,
             operator_identity,
             operators: 0,
+            learning: Learning::default(),
         })
     }
 
@@ -264,6 +267,7 @@ impl Pair {
             skill,
             recogniser: None,
             config,
+            learning: self.learning.clone(),
             patience: Duration::from_secs(5),
         };
         let (quit, quit_rx) = watch::channel(false);

@@ -98,6 +98,8 @@ pub struct Session {
     epoch: u32,
     clock: SessionClock,
     skill: Option<Arc<Skill>>,
+    /// Takes its place at the next engage.
+    next_skill: Option<Arc<Skill>>,
     plan: Option<(u32, PosePlan)>,
     mirror: Option<Mirror>,
     engagement: u32,
@@ -130,6 +132,7 @@ impl Session {
             epoch,
             clock: SessionClock::default(),
             skill,
+            next_skill: None,
             plan: None,
             mirror: None,
             engagement: 0,
@@ -154,7 +157,7 @@ impl Session {
 
     /// The model held, for the next session.
     pub fn skill(&self) -> Option<Arc<Skill>> {
-        self.skill.clone()
+        self.next_skill.as_ref().or(self.skill.as_ref()).cloned()
     }
 
     /// The clock estimate.
@@ -339,11 +342,24 @@ impl Session {
     fn store_model(&mut self, id: ModelId, bytes: &[u8]) {
         match Skill::from_bytes(bytes) {
             Ok(skill) if skill.id().0 == id => {
-                self.skill = Some(Arc::new(skill));
+                // What is being followed goes on with the model it began with: another one would be a jump.
+                let skill = Some(Arc::new(skill));
+                if self.is_following() {
+                    self.next_skill = skill;
+                } else {
+                    (self.skill, self.next_skill) = (skill, None);
+                }
                 self.send(&RobotControl::ModelStored { id });
             }
             _ => self.refuse(Refusal::BadModel),
         }
+    }
+
+    /// Something is followed, or was granted a moment ago.
+    fn is_following(&self) -> bool {
+        let state = self.report.map(|r| r.state);
+        self.acknowledged != self.engagement
+            || matches!(state, Some(RobotState::Engaged | RobotState::Coasting))
     }
 
     fn engage(&mut self, now: Mono, engage: &Engage) -> Result<(), Refusal> {
@@ -362,6 +378,9 @@ impl Session {
         // What was granted a moment ago is not in a report yet.
         if self.acknowledged != self.engagement {
             return Err(Refusal::AlreadyEngaged);
+        }
+        if let Some(next) = self.next_skill.take() {
+            self.skill = Some(next);
         }
         let [w, x, y, z] = engage.rotation.map(f64::from);
         let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
