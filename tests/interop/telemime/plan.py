@@ -1,0 +1,153 @@
+"""A finished motion: points as bits, and the natural spline through them (§9)."""
+
+from .codec import Bytes, Option, Struct, WireError, require, unzigzag, zigzag
+
+MOST, FAR = 4096, 1 << 30
+PLAN_BYTES = Bytes(131_072)
+PLAN = Struct(("position", PLAN_BYTES), ("turn", Option(PLAN_BYTES)), ("grip", Option(PLAN_BYTES)))
+
+
+class BitReader:
+    def __init__(self, data):
+        self.data, self.at = data, 0
+
+    def bits(self, n):
+        value = 0
+        for _ in range(n):
+            if self.at == 8 * len(self.data):
+                raise WireError("Malformed", "bits wanted after the end")
+            value = value << 1 | self.data[self.at // 8] >> 7 - self.at % 8 & 1
+            self.at += 1
+        return value
+
+    def golomb(self, k):
+        zeros = 0
+        while not self.bits(1):
+            zeros += 1
+            require(zeros <= 40, "code", "longer than 2^40")
+        q = 1 << zeros | self.bits(zeros)
+        n = q - 1 << k | self.bits(k)
+        require(n < 1 << 40, "code", n)
+        return n
+
+    def signed(self, k):
+        return unzigzag(self.golomb(k))
+
+
+class BitWriter:
+    def __init__(self):
+        self.value, self.n = 0, 0
+
+    def bits(self, value, n):
+        self.value, self.n = self.value << n | value, self.n + n
+
+    def golomb(self, n, k):
+        q = (n >> k) + 1
+        self.bits(q, 2 * q.bit_length() - 1)
+        self.bits(n & (1 << k) - 1, k)
+
+    def signed(self, n, k):
+        self.golomb(zigzag(n), k)
+
+    def bytes(self):
+        fill = -self.n % 8
+        return (self.value << fill).to_bytes((self.n + fill) // 8, "big")
+
+
+def cost(n, k):
+    """Bits of G(k) of n."""
+    return 2 * ((n >> k) + 1).bit_length() - 1 + k
+
+
+def expected(rule, older, last, t):
+    """What a rule expects of a coordinate at tick t after (tick, value) twice; without an older point, the last value."""
+    t1, x1 = last
+    if older is None or rule == 0:
+        return x1
+    t0, x0 = older
+    if rule == 3:
+        return x0
+    x = x1 + (x1 - x0) * (t - t1) // ((t1 - t0) * (1 if rule == 1 else 2))
+    return max(-FAR, min(FAR, x))
+
+
+def _power(n):
+    """(digits, power) with the largest power of ten."""
+    power = 0
+    while n % 10 == 0 and power < 15:
+        n, power = n // 10, power + 1
+    return n, power
+
+
+def unpack(data, dims):
+    """{step_nm, tick_us, points: [(tick, values)]} of a plan's bits."""
+    r = BitReader(data)
+    count = r.golomb(5)
+    require(2 <= count <= MOST, "points", count)
+    step = r.golomb(4) * 10 ** r.bits(4)
+    tick = r.golomb(4) * 10 ** r.bits(4)
+    points = [(r.golomb(0), [r.signed(10) for _ in range(dims)])]
+    gaps = r.bits(5)
+    rules = [(r.bits(2), r.bits(5)) for _ in range(dims)]
+    for _ in range(count - 1):
+        last, older = points[-1], points[-2] if len(points) > 1 else None
+        t = last[0] + 1 + r.golomb(gaps)
+        values = []
+        for d, (rule, order) in enumerate(rules):
+            before = None if older is None else (older[0], older[1][d])
+            values.append(expected(rule, before, (last[0], last[1][d]), t) + r.signed(order))
+        points.append((t, values))
+    plan = {"step_nm": step, "tick_us": tick, "points": points}
+    check(plan)
+    if r.at + 7 < 8 * len(data):
+        raise WireError("Trailing", "bytes after the last point")
+    if pack(plan) != data:
+        raise WireError("NotCanonical", "packs differently")
+    return plan
+
+
+def check(plan):
+    """Raises unless everything is in its range."""
+    require(plan["step_nm"] >= 1, "step_nm", plan["step_nm"])
+    require(1 <= plan["tick_us"] <= 1_000_000, "tick_us", plan["tick_us"])
+    for tick, values in plan["points"]:
+        require(tick < 1 << 32, "tick", tick)
+        require(all(abs(n) <= FAR for n in values), "point", values)
+
+
+def pack(plan):
+    """The one encoding: for each column what costs least, of equals the lowest rule, of its orders the lowest."""
+    points = plan["points"]
+    dims = len(points[0][1])
+    gap = [b[0] - a[0] - 1 for a, b in zip(points, points[1:])]
+    order = min(range(32), key=lambda k: sum(cost(n, k) for n in gap))
+    columns = []
+    for d in range(dims):
+        rests = []
+        for rule in range(4):
+            rest = []
+            for i in range(1, len(points)):
+                older = (points[i - 2][0], points[i - 2][1][d]) if i > 1 else None
+                t, values = points[i]
+                rest.append(values[d] - expected(rule, older, (points[i - 1][0], points[i - 1][1][d]), t))
+            rests.append(rest)
+        _, rule, k = min((sum(cost(zigzag(n), k) for n in rests[rule]), rule, k) for rule in range(4) for k in range(32))
+        columns.append((rule, k, rests[rule]))
+    w = BitWriter()
+    w.golomb(len(points), 5)
+    for n in (plan["step_nm"], plan["tick_us"]):
+        digits, power = _power(n)
+        w.golomb(digits, 4)
+        w.bits(power, 4)
+    w.golomb(points[0][0], 0)
+    for n in points[0][1]:
+        w.signed(n, 10)
+    w.bits(order, 5)
+    for rule, k, _ in columns:
+        w.bits(rule, 2)
+        w.bits(k, 5)
+    for i, n in enumerate(gap):
+        w.golomb(n, order)
+        for _, k, rest in columns:
+            w.signed(rest[i], k)
+    return w.bytes()
