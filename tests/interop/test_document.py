@@ -6,7 +6,7 @@ import document
 from telemime import codec, frames, greeting, lease, messages, path, plan, predict, rotation, skill, spline, state
 
 STATE = bytes.fromhex("fc808d5b00 fb401ffb9f0ffb50c3 050afc0018f70132ec0250e205")
-PARAMS = [255, 230, 128]
+PARAMS = {"gain": 255, "trust": 230, "cv_damping": 128}
 
 
 def hand():
@@ -138,7 +138,7 @@ class Document(unittest.TestCase):
         apart = [predict.sub(h.x, m) for m in h.m]
         novelty = model.respond(h.x + sum(apart, []))[2]
         self.near(says["novelty"], [novelty])
-        self.near(says["weight"], [model.share(PARAMS[1] / 255, novelty)])
+        self.near(says["weight"], [model.share(PARAMS["trust"] / 255, novelty)])
         self.near(says["mixture(3)"], model.mixture(h.x + sum(apart, []))[0][2])
         f = predict.place(h, PARAMS, model)
         d, sigma = f.at(0.1)

@@ -44,3 +44,15 @@ def evaluate(before, after, grid, t):
         x.append(x0 + h * (v0 * u + b * u * u + a * u**3))
         v.append(v0 + 2 * b * u + 3 * a * u * u)
     return x, v
+
+
+def encode(state, knots, grid):
+    """The `knots` of a message with this state: each (tick, position in steps, tangent in steps, start)."""
+    tick = (state["t_us"] + 5) // 10
+    at = [round_away(1e-4 * n / grid.step) for n in state["x"]]
+    out = []
+    for i, (t, x, v, start) in enumerate(knots):
+        gap = t - tick if i else tick - t
+        out.append({"dt": 2 * gap + start, "dx": [a - b for a, b in zip(x, at)], "v": list(v)})
+        tick, at = t, x
+    return out

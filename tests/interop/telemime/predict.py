@@ -109,7 +109,7 @@ def velocity(apart):
 
 
 def _forecast(apart, params, model, features, noise):
-    gain, trust, damping = (b / 255 for b in params)
+    gain, trust, damping = (params[name] / 255 for name in ("gain", "trust", "cv_damping"))
     v, a = velocity(apart)
     if model is None:
         d, sigma = [[0.0] * 3], [0.0]

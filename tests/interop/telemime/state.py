@@ -24,7 +24,7 @@ def _turn_ranges(s):
     require(s["memory_exponent"] <= 10, "memory_exponent", s["memory_exponent"])
 
 
-PARAMS = Array(U8, 3)
+PARAMS = Struct(("gain", U8), ("trust", U8), ("cv_damping", U8))
 ROTATION = Array(I16, 3)
 STATE = Struct(
     ("t_us", I64), ("x", Array(I32, 3)), ("memory_exponent", U8), ("memory", Array(Array(I8, 3), 4)), check=_state_ranges
