@@ -20,14 +20,14 @@ class Document(unittest.TestCase):
             self.assertAlmostEqual(float(word), value, delta=0.6 * 10**-digits)
 
     def test_greetings(self):
-        for name, value in [
-            ("hello", {"Hello": {"min": 1, "max": 1, "features": 0}}),
-            ("hello-ack", {"HelloAck": {"version": 1, "features": 0, "epoch": 7}}),
-            ("reject", {"Reject": {"code": 2, "text": "another operator has authority"}}),
+        for name, kinds, value in [
+            ("hello", greeting.OPERATOR, {"Hello": {"min": 1, "max": 1, "features": 0}}),
+            ("hello-ack", greeting.ROBOT, {"HelloAck": {"version": 1, "features": 0, "epoch": 7}}),
+            ("reject", greeting.ROBOT, {"Reject": {"code": 2, "text": "another operator has authority"}}),
         ]:
             data = document.example(name)
-            self.assertEqual(greeting.parse(data), (value, len(data)))
-            self.assertIsNone(greeting.parse(data[:-1]))
+            self.assertEqual(greeting.parse(data, kinds), (value, len(data)))
+            self.assertIsNone(greeting.parse(data[:-1], kinds))
         self.assertEqual(greeting.hello(1, 1), document.example("hello"))
         self.assertEqual(greeting.hello_ack(1, 7), document.example("hello-ack"))
         self.assertEqual(greeting.reject(2, "another operator has authority"), document.example("reject"))
@@ -110,10 +110,8 @@ class Document(unittest.TestCase):
 
     def test_plan(self):
         says = document.numbers("plan")
-        sent = codec.decode(plan.PLAN, document.example("plan"), 131_072)
-        p = plan.unpack(sent["position"], 3)
+        p = codec.decode(plan.PLAN, document.example("plan"), plan.LONGEST)["position"]
         self.assertEqual(p["points"], [(0, [100, 0, -300]), (250, [150, 50, -300]), (400, [200, 10, 700])])
-        self.assertEqual(plan.pack(p), sent["position"])
         for name, value in zip("xva", spline.of_plan(p).at(0.1)):
             self.near(says[f"plan {name}(0.1)"], value)
 

@@ -11,6 +11,7 @@ mod commands;
 mod data;
 mod frames;
 mod ingest;
+mod interop;
 mod layout;
 mod mirror;
 mod paper;

@@ -24,13 +24,18 @@ def reject(code, text):
     return MAGIC + struct.pack("<BHB", 3, code, len(data)) + data
 
 
-def parse(data):
-    """(greeting, number of bytes) from the beginning of a stream, or None while it is not complete."""
+OPERATOR, ROBOT = (1,), (2, 3)
+
+
+def parse(data, kinds=ROBOT):
+    """(greeting, number of bytes) from the beginning of a stream, or None while it is not complete. `kinds`: who sent it."""
     if data[:4] != MAGIC[: len(data)]:
-        raise WireError("Malformed", "not the magic")
+        raise WireError("Magic", "another protocol")
     if len(data) < 5:
         return None
     kind = data[4]
+    if kind not in kinds:
+        raise WireError("Kind", f"greeting of kind {kind}")
     if kind == 3:
         if len(data) < 8:
             return None
@@ -40,17 +45,15 @@ def parse(data):
         try:
             return {"Reject": {"code": code, "text": data[8 : 8 + n].decode("utf-8")}}, 8 + n
         except UnicodeDecodeError as e:
-            raise WireError("Malformed", f"not UTF-8: {e}") from None
+            raise WireError("Text", f"not UTF-8: {e}") from None
     layout = {1: ("Hello", "<HHQ", ("min", "max", "features")), 2: ("HelloAck", "<HQI", ("version", "features", "epoch"))}
-    if kind not in layout:
-        raise WireError("Malformed", f"greeting of kind {kind}")
     name, code, fields = layout[kind]
     end = 5 + struct.calcsize(code)
     if len(data) < end:
         return None
     value = dict(zip(fields, struct.unpack_from(code, data, 5)))
     if name == "Hello" and value["min"] > value["max"]:
-        raise WireError("Invalid", f"versions {value['min']} to {value['max']}")
+        raise WireError("Range", f"versions {value['min']} to {value['max']}")
     return {name: value}, end
 
 

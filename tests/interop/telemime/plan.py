@@ -1,10 +1,13 @@
 """A finished motion: points as bits, and the natural spline through them (§9)."""
 
-from .codec import Bytes, Option, Struct, WireError, require, unzigzag, zigzag
+import math
+
+from . import spline
+from .codec import Bytes, Kind, Option, Struct, WireError, require, unzigzag, zigzag
 
 MOST, FAR = 4096, 1 << 30
-PLAN_BYTES = Bytes(131_072)
-PLAN = Struct(("position", PLAN_BYTES), ("turn", Option(PLAN_BYTES)), ("grip", Option(PLAN_BYTES)))
+LONGEST = 131_072
+BYTES = Bytes(LONGEST)
 
 
 class BitReader:
@@ -24,10 +27,12 @@ class BitReader:
         zeros = 0
         while not self.bits(1):
             zeros += 1
-            require(zeros <= 40, "code", "longer than 2^40")
+            if zeros > 40:
+                raise WireError("Malformed", "a number beyond 2^40")
         q = 1 << zeros | self.bits(zeros)
         n = q - 1 << k | self.bits(k)
-        require(n < 1 << 40, "code", n)
+        if n >= 1 << 40:
+            raise WireError("Malformed", "a number beyond 2^40")
         return n
 
     def signed(self, k):
@@ -100,9 +105,7 @@ def unpack(data, dims):
     plan = {"step_nm": step, "tick_us": tick, "points": points}
     check(plan)
     if r.at + 7 < 8 * len(data):
-        raise WireError("Trailing", "bytes after the last point")
-    if pack(plan) != data:
-        raise WireError("NotCanonical", "packs differently")
+        raise WireError("Malformed", "bytes after the last point")
     return plan
 
 
@@ -151,3 +154,61 @@ def pack(plan):
         for _, k, rest in columns:
             w.signed(rest[i], k)
     return w.bytes()
+
+
+class Bits(Kind):
+    """A plan of so many coordinates, among bytes: one that breaks a rule is malformed."""
+
+    def __init__(self, dims):
+        self.dims = dims
+
+    def read(self, r):
+        try:
+            return unpack(BYTES.read(r), self.dims)
+        except WireError as e:
+            raise WireError("Malformed", str(e)) from None
+
+    def write(self, value, out):
+        BYTES.write(pack(value), out)
+
+
+class Pose(Struct):
+    """The plan of a whole motion."""
+
+    def read(self, r):
+        value = super().read(r)
+        curves = Curves(value)
+        if not curves.usable():
+            raise WireError("Malformed", "an orientation or a gripper out of range")
+        return value
+
+
+class Curves:
+    """What a whole plan says of any time."""
+
+    def __init__(self, plan):
+        self.plan = plan
+        self.position, self.turn, self.grip = (
+            plan[name] and spline.of_plan(plan[name]) for name in ("position", "turn", "grip")
+        )
+
+    def usable(self):
+        if self.turn:
+            if any(abs(math.hypot(*x) - 1) > 0.25 for x in self.turn.x):
+                return False
+            for a, b in zip(self.turn.t, self.turn.t[1:]):
+                if any(math.hypot(*self.turn.at(a + (b - a) * i / 8)[0]) < 0.5 for i in range(1, 8)):
+                    return False
+        return not self.grip or all(-0.05 <= x[0] <= 1.05 for x in self.grip.x)
+
+    def orientation(self, t):
+        """The curve, normalised; of q and −q the one with w ≥ 0."""
+        q = self.turn.at(t)[0]
+        n = math.copysign(math.hypot(*q), q[0])
+        return [c / n for c in q]
+
+    def opening(self, t):
+        return min(1.0, max(0.0, self.grip.at(t)[0][0]))
+
+
+PLAN = Pose(("position", Bits(3)), ("turn", Option(Bits(4))), ("grip", Option(Bits(1))))

@@ -114,12 +114,13 @@ STATS = Struct(
 
 def _skill(s):
     finite("skill", s["duration_s"], s["pace"], *s["stats"].values())
-    require(s["duration_s"] > 0, "duration_s", s["duration_s"])
+    require(0 < s["duration_s"] <= 3600, "duration_s", s["duration_s"])
     require(s["pace"][1] > 0, "pace", s["pace"])
     names = [f["name"] for f in s["task"] or []]
     require(len(set(names)) == len(names), "task", names)
     for name in ("speed", "accel", "reach"):
         require(s["stats"][name] >= 0, name, s["stats"][name])
+    require(all(a <= b for a, b in zip(s["stats"]["lower"], s["stats"]["upper"])), "box", s["stats"])
     require(all(n >= 1 for n in s["samples"]), "samples", s["samples"])
 
 
