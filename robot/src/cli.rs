@@ -54,6 +54,9 @@ pub struct Args {
         allow_negative_numbers = true
     )]
     pub start: Option<Vec<f64>>,
+    /// Speak protocol versions up to this one; 2 is an experiment [default: 1].
+    #[arg(long, value_name = "N")]
+    pub protocol_max: Option<u16>,
     /// Write every tick to this CSV file.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
@@ -78,6 +81,7 @@ struct File {
     #[serde(default)]
     fixed: std::collections::BTreeMap<String, f64>,
     start: Option<Vec<f64>>,
+    protocol_max: Option<u16>,
     record: Option<PathBuf>,
 }
 
@@ -107,6 +111,7 @@ pub enum Event {
     },
     Connected {
         epoch: u32,
+        version: u16,
         peer: SocketAddr,
     },
     Disconnected {
@@ -242,7 +247,10 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         endpoint,
         HostClock::new(),
         rig.info(),
-        SessionConfig::default(),
+        SessionConfig {
+            versions: cli::versions(args.protocol_max.or(file.protocol_max))?,
+            ..SessionConfig::default()
+        },
         handle,
         Some(running.timing.clone()),
     );
@@ -334,10 +342,17 @@ async fn listen_to(
                     });
                 }
             }
-            Notice::Connected { epoch, peer } => {
-                log.say(&Event::Connected { epoch, peer }, || {
-                    format!("operator {peer} (session {epoch})")
-                });
+            Notice::Connected {
+                epoch,
+                version,
+                peer,
+            } => {
+                let connected = Event::Connected {
+                    epoch,
+                    version: version.number(),
+                    peer,
+                };
+                log.say(&connected, || format!("operator {peer} (session {epoch})"));
             }
             Notice::Disconnected {
                 why,

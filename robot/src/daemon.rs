@@ -8,9 +8,10 @@ use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::{HostClock, quic};
 use telemime_protocol::skill::Skill;
+use telemime_protocol::wire::Version;
 use telemime_protocol::wire::frame::Frame;
-use telemime_protocol::wire::hello::{Answer, Hello, RejectCode, negotiate};
-use telemime_protocol::wire::v1::{self, Cause, Info, RobotState};
+use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
+use telemime_protocol::wire::v1::{Cause, Info, RobotState};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep_until};
 
@@ -65,6 +66,8 @@ pub enum Notice {
     Connected {
         /// The session's epoch.
         epoch: u32,
+        /// The protocol version both speak.
+        version: Version,
         /// Its address.
         peer: std::net::SocketAddr,
     },
@@ -230,31 +233,33 @@ impl Daemon {
             control,
             hello,
         } = greeted;
-        let refusal = match negotiate(&hello, v1::VERSION, v1::VERSION) {
-            None => Some((
+        let versions = self.config.versions;
+        let agreed = match versions.choose(&hello) {
+            None => Err((
                 RejectCode::Version,
                 format!(
-                    "this robot speaks version {}, you offer {} to {}",
-                    v1::VERSION,
-                    hello.min,
-                    hello.max
+                    "this robot speaks {versions}, you offer {} to {}",
+                    hello.min, hello.max
                 ),
             )),
-            Some(_) if active.is_some() => Some((
+            Some(_) if active.is_some() => Err((
                 RejectCode::Busy,
                 "another operator has authority".to_owned(),
             )),
-            Some(_) => None,
+            Some(version) => Ok(version),
         };
         let peer = connection.remote_address();
-        if let Some((code, text)) = refusal {
-            let why = format!("{peer}: {text}");
-            tokio::spawn(turn_away(connection, control, code, text));
-            return Some(why);
-        }
+        let version = match agreed {
+            Ok(version) => version,
+            Err((code, text)) => {
+                let why = format!("{peer}: {text}");
+                tokio::spawn(turn_away(connection, control, code, text));
+                return Some(why);
+            }
+        };
         *epoch += 1;
         let ack = Answer::Ack {
-            version: v1::VERSION,
+            version: version.number(),
             features: 0,
             epoch: *epoch,
         };
@@ -267,7 +272,8 @@ impl Daemon {
             *epoch,
             skill.clone(),
             self.clock.now(),
-        );
+        )
+        .speaking(version);
         *active = Some(Active {
             session,
             connection,
@@ -276,6 +282,7 @@ impl Daemon {
         });
         let _ = notices.send(Notice::Connected {
             epoch: *epoch,
+            version,
             peer,
         });
         None

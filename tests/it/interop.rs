@@ -19,5 +19,8 @@ fn the_python_implementation_agrees() {
     }
     let out = python(&["-m", "unittest"]).unwrap();
     let said = String::from_utf8_lossy(&out.stderr);
-    assert!(out.status.success() && !said.contains("Ran 0 tests"), "{said}");
+    assert!(
+        out.status.success() && !said.contains("Ran 0 tests"),
+        "{said}"
+    );
 }

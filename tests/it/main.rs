@@ -26,4 +26,5 @@ mod safety;
 mod scene;
 mod selection;
 mod strangers;
+mod versions;
 mod wrist;

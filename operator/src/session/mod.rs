@@ -18,6 +18,7 @@ use std::sync::Arc;
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::Version;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::v1::{
     Drive, Engage, Info, Message, OperatorControl, OperatorDatagram, PathTail, Refusal, RobotState,
@@ -50,6 +51,7 @@ enum Activity {
 /// One session with a robot.
 pub struct Session {
     config: SessionConfig,
+    version: Version,
     epoch: u32,
     skill: Option<Arc<Skill>>,
     info: Option<Info>,
@@ -80,6 +82,7 @@ impl Session {
     pub fn new(config: SessionConfig, skill: Option<Arc<Skill>>, epoch: u32) -> Self {
         Self {
             config,
+            version: Version::V1,
             epoch,
             skill,
             info: None,
@@ -102,6 +105,13 @@ impl Session {
             outputs: VecDeque::new(),
             events: VecDeque::new(),
         }
+    }
+
+    /// Speaks `version` instead of version 1.
+    #[must_use]
+    pub fn speaking(mut self, version: Version) -> Self {
+        self.version = version;
+        self
     }
 
     /// Reports with [`Event::Recognised`] which of these skills the hand performs, whenever that changes. It
@@ -385,7 +395,7 @@ impl Session {
         };
         self.counters.messages += 1;
         self.outputs.push_back(Output::Datagram {
-            bytes: datagram.encode(),
+            bytes: self.version.encode_operator_datagram(&datagram),
             motion: true,
         });
     }
@@ -430,7 +440,7 @@ impl Session {
 
     fn datagram(&mut self, message: &OperatorDatagram) {
         self.outputs.push_back(Output::Datagram {
-            bytes: message.encode(),
+            bytes: self.version.encode_operator_datagram(message),
             motion: false,
         });
     }
