@@ -12,9 +12,10 @@ use telemime_protocol::wire::Version;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::v1::{Cause, Info, RobotState};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
+use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep_until};
 
+use crate::door::{self, Door, Place, Verdict};
 use crate::servo::thread::Timing;
 use crate::servo::{Handle, Order, Report};
 use crate::session::{Counters, Output, Session, SessionConfig, TickTiming};
@@ -37,9 +38,6 @@ const MAX_SILENT_DRAINS: u32 = 125;
 
 /// A stop takes a fraction of a second; after this many drains (2 s) the servo itself must be dead.
 const MAX_STOP_DRAINS: u32 = 500;
-
-/// Connections that may be greeting at the same time.
-const MAX_GREETING: usize = 8;
 
 /// What the daemon needs.
 #[derive(Debug)]
@@ -141,13 +139,13 @@ impl Daemon {
         mut words: mpsc::UnboundedReceiver<Word>,
         notices: mpsc::UnboundedSender<Notice>,
     ) -> Result<(), ServoDead> {
-        let (greeted_tx, mut greeted) = mpsc::channel::<Greeted>(MAX_GREETING);
+        let (greeted_tx, mut greeted) = mpsc::channel::<Greeted>(door::PLACES);
         let mut drain = interval(DRAIN);
         drain.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut active: Option<Active> = None;
         let mut skill: Option<Arc<Skill>> = None;
         let mut epoch = 0;
-        let permits = Arc::new(Semaphore::new(MAX_GREETING));
+        let door = Door::default();
         loop {
             let ended = self.flush(active.as_mut());
             if let Some(why) = ended {
@@ -180,12 +178,18 @@ impl Daemon {
                     }
                 }
                 incoming = self.endpoint.accept() => match incoming {
-                    Some(incoming) => match permits.clone().try_acquire_owned() {
-                        Ok(permit) => {
-                            tokio::spawn(greet(incoming, permit, greeted_tx.clone(), notices.clone()));
+                    Some(incoming) => {
+                        let from = incoming.remote_address().ip();
+                        match door.knock(from, incoming.remote_address_validated()) {
+                            Verdict::Enter(place) => {
+                                let greeting = greet(incoming, place, greeted_tx.clone(), notices.clone());
+                                tokio::spawn(tokio::time::timeout(door::STAY, greeting));
+                            }
+                            // It may not be asked twice: then it knows a token already.
+                            Verdict::Prove => drop(incoming.retry().map_err(|e| e.into_incoming().refuse())),
+                            Verdict::Refuse => incoming.refuse(),
                         }
-                        Err(_) => incoming.refuse(),
-                    },
+                    }
                     None => break,
                 },
                 Some(next) = greeted.recv() => {
@@ -422,7 +426,7 @@ async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<(u32,
 /// Handshake and greeting, beside the running session.
 async fn greet(
     incoming: Incoming,
-    _permit: OwnedSemaphorePermit,
+    _place: Place,
     greeted: mpsc::Sender<Greeted>,
     notices: mpsc::UnboundedSender<Notice>,
 ) {
