@@ -19,8 +19,8 @@ from cryptography.hazmat.primitives.asymmetric import ed25519
 from client import dial, fingerprint
 from telemime import path, state
 
-RADIUS, TURNS_PER_S, SECONDS, SCALE, BOUND_UM = 0.12, 0.4, 6.0, 0.5, 5_000
-FAST_RATE, LEASE_MS = 1 / 30, 650
+RADIUS, TURNS_PER_S, SECONDS, SCALE = 0.12, 0.4, 6.0, 0.5
+BOUND_UM, SAMPLE_US, LEASE_MS = 5_000, 33_333, 650
 CONSTANT_VELOCITY = {"gain": 255, "trust": 0, "cv_damping": 255}
 
 
@@ -78,16 +78,20 @@ class Hand:
 
     def __init__(self, operator, circle, engagement):
         self.operator, self.circle, self.engagement = operator, circle, engagement
-        self.grid = path.Grid(BOUND_UM)
+        self.grid = path.Grid(BOUND_UM, SAMPLE_US)
         self.state, self.knots, self.seq = None, [], 0
 
     def sample(self):
         t = self.operator.clock_us() * 1e-6
         x, v = self.circle.at(t)
         self.state = self.state.next(t, x) if self.state else state.Hand(t, x)
-        if not self.knots or t - self.knots[-1][0] * path.TICK > 0.1:
-            steps = [state.round_away(c / self.grid.step) for c in x], [state.round_away(c / self.grid.speed_step) for c in v]
-            self.knots.append((round(t / path.TICK), *steps, not self.knots))
+        last = self.knots[-1] if self.knots else None
+        if not last or t - last.tick * path.TICK > 0.1:
+            self.knots.append(path.quantise(self.grid, t, x, v, last))
+
+    def block(self, wire, first, most):
+        """The knots from number `first` on, relative to those before them."""
+        return path.encode(wire, self.knots[first : first + most], self.grid, self.knots[:first])
 
     def acknowledged(self):
         told = [t for t in self.operator.telemetry if t["engagement"] == self.engagement]
@@ -95,12 +99,11 @@ class Hand:
 
     def motion(self):
         wire, first = self.state.wire(), self.acknowledged()
-        knots = self.knots[first : first + 32]
         self.seq += 1
         return {"Motion": {
             "epoch": self.operator.epoch, "engagement": self.engagement, "seq": self.seq, "lease_ms": LEASE_MS, "model": 0,
             "params": CONSTANT_VELOCITY, "checksum": None, "state": wire, "pose": {"turn": None, "grip": None},
-            "first_knot": first, "knots": path.encode(wire, knots, self.grid),
+            "first_knot": first, "knots": self.block(wire, first, 32),
         }}  # fmt: skip
 
     def engage(self):
@@ -108,7 +111,7 @@ class Hand:
             "state": self.state.wire(), "model": 0, "params": CONSTANT_VELOCITY, "pose": {"turn": None, "grip": None}}}  # fmt: skip
         return {"Engage": {
             "engagement": self.engagement, "t_us": self.operator.clock_us(), "drive": drive, "scale": SCALE,
-            "rotation": [1.0, 0.0, 0.0, 0.0], "path_bound_um": BOUND_UM, "lease_ms": LEASE_MS,
+            "rotation": [1.0, 0.0, 0.0, 0.0], "path_bound_um": BOUND_UM, "sample_us": SAMPLE_US, "lease_ms": LEASE_MS,
         }}  # fmt: skip
 
     async def move(self, seconds):
@@ -117,7 +120,7 @@ class Hand:
         while self.operator.clock_us() < end:
             self.sample()
             self.operator.datagram(self.motion())
-            await asyncio.sleep(FAST_RATE)
+            await asyncio.sleep(SAMPLE_US * 1e-6)
 
 
 async def session(robot, key, certificate):
@@ -135,13 +138,11 @@ async def session(robot, key, certificate):
         await hand.move(SECONDS)
         # The path to its end: a knot at the newest sample, and what was not acknowledged, by the stream.
         last, first = hand.state, hand.acknowledged()
-        if hand.knots[-1][0] < round(last.t / path.TICK):
-            v = hand.circle.at(last.t)[1]
-            steps = [state.round_away(c / hand.grid.step) for c in last.x], [state.round_away(c / hand.grid.speed_step) for c in v]
-            hand.knots.append((round(last.t / path.TICK), *steps, False))
+        if hand.knots[-1].tick < round(last.t / path.TICK):
+            hand.knots.append(path.quantise(hand.grid, last.t, *hand.circle.at(last.t), hand.knots[-1]))
         wire = last.wire()
         operator.say({"Path": {
-            "engagement": 1, "state": wire, "first_knot": first, "knots": path.encode(wire, hand.knots[first:], hand.grid)}})  # fmt: skip
+            "engagement": 1, "state": wire, "first_knot": first, "knots": hand.block(wire, first, 1024)}})  # fmt: skip
         operator.say({"Release": {"engagement": 1}})
         while (told := await operator.hear("State"))["state"] != "Ready" or told["cause"] != "Requested":
             pass

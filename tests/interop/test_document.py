@@ -101,10 +101,16 @@ class Document(unittest.TestCase):
     def test_path(self):
         says = document.numbers("path")
         m = messages.read("operator datagram", document.example("motion"))["Motion"]
-        grid = path.Grid(20_000)
-        knots = path.knots(m, grid)
-        self.assertEqual(knots, [(240_000, [70, -40, 500], [3, -4, 0], True), (270_000, [80, -41, 502], [0, 2, 0], False)])
-        x, v = path.evaluate(*knots, grid, 2.5)
+        grid = path.Grid(20_000, 33_333)
+        knots = path.decode(m["state"], m["knots"], grid)
+        told = [[240_000, [35, -20, 250], [2, -4, 0], True], [270_000, [40, -20, 251], [0, 2, 0], False]]
+        self.assertEqual([k.plain() for k in knots], told)
+        self.assertEqual(path.encode(m["state"], knots, grid), m["knots"])
+        later = messages.read("operator control", document.example("path"))["Path"]
+        (last,) = path.decode(later["state"], later["knots"], grid, knots)
+        self.assertEqual(last.plain(), [280_002, [43, -21, 251], [16, 0, -8], False])
+        self.assertEqual(path.encode(later["state"], [last], grid, knots), later["knots"])
+        x, v = path.evaluate(*knots, grid, 2_500_000_000)
         self.near(says["path x(2.5)"], x)
         self.near(says["path v(2.5)"], v)
 

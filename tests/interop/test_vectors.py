@@ -127,14 +127,16 @@ class Vectors(unittest.TestCase):
 
     def test_paths(self):
         for data, value in self.each("path"):
-            grid = path.Grid(value["path_bound_um"])
+            grid = path.Grid(value["path_bound_um"], value["sample_us"])
             m = messages.read("operator control", data)["Path"]
-            knots = path.knots(m, grid)
-            self.assertEqual(plain(knots), value["knots"])
-            self.assertEqual(path.encode(m["state"], knots, grid), m["knots"])
-            joined = [(a, b) for a, b in zip(knots, knots[1:]) if not b[3]]
+            knots = [path.Knot(*k) for k in value["knots"]]
+            held, sent = knots[: value["before"]], knots[value["before"] :]
+            found = path.decode(m["state"], m["knots"], grid, held)
+            self.assertEqual([k.plain() for k in found], [k.plain() for k in sent])
+            self.assertEqual(path.encode(m["state"], sent, grid, held), m["knots"])
+            joined = [(a, b) for a, b in zip(knots, knots[1:]) if not b.start]
             for (a, b), at in zip(joined, value["at"], strict=True):
-                x, v = path.evaluate(a, b, grid, at["t_ns"] * 1e-9)
+                x, v = path.evaluate(a, b, grid, at["t_ns"])
                 self.near([at["x"], at["v"]], [x, v])
 
     def test_plans(self):

@@ -7,12 +7,13 @@ use libfuzzer_sys::fuzz_target;
 use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid};
 use telemime_protocol::predict::{Forecast, checksum};
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::Version;
 use telemime_protocol::wire::frame::{self, Deframer};
 use telemime_protocol::wire::hello::{Answer, Hello};
+use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::WirePose;
 use telemime_protocol::wire::v1::*;
-use telemime_protocol::wire::{Version, knots};
 
 fn canonical<M: Message>(bytes: &[u8]) -> Option<M> {
     let message = M::decode(bytes).ok()?;
@@ -34,13 +35,24 @@ fn foretell(state: &WireState, params: &WireParams, pose: &WirePose) {
     checksum(&place, turn.as_ref());
 }
 
-fn follow(state: &WireState, sent: &[WireKnot], bound_um: u32) {
-    let Ok(grid) = PathGrid::for_bound(f64::from(bound_um) * 1e-6) else {
+fn follow(state: &WireState, sent: &KnotBlock, limit: usize) {
+    let code = PathCode {
+        grid: PathGrid::for_bound(0.02).expect("a usable bound"),
+        sample_us: 33_333,
+    };
+    let Ok(knots) = sent.unpack(state, code, &[], limit) else {
         return;
     };
-    let mut path = PathDecoder::new(grid, sent.len());
-    for knot in knots::unpack(state, grid, sent) {
-        let _ = path.append(&knot);
+    assert!(knots.len() <= limit);
+    // What was read can be written again, and reads the same.
+    let again = KnotBlock::pack(state, code, &[], &knots).expect("it has travelled");
+    assert_eq!(
+        again.unpack(state, code, &[], limit).as_deref(),
+        Ok(&knots[..])
+    );
+    let mut path = PathDecoder::new(code.grid, limit);
+    for knot in &knots {
+        let _ = path.append(knot);
     }
     let ends: Vec<Stamp> = path.knots().map(|k| k.t).collect();
     for w in ends.windows(2) {
@@ -67,14 +79,14 @@ fuzz_target!(|data: &[u8]| {
                     },
                 ..
             })) => foretell(&state, &params, &pose),
-            Some(OperatorControl::Path(tail)) => follow(&tail.state, &tail.knots, 20_000),
+            Some(OperatorControl::Path(tail)) => follow(&tail.state, &tail.knots, MAX_TAIL_KNOTS),
             _ => {}
         },
         1 => drop(canonical::<RobotControl>(bytes)),
         2 => {
             if let Some(OperatorDatagram::Motion(motion)) = canonical(bytes) {
                 foretell(&motion.state, &motion.params, &motion.pose);
-                follow(&motion.state, &motion.knots, 20_000);
+                follow(&motion.state, &motion.knots, MAX_KNOTS);
             }
         }
         3 => drop(canonical::<RobotDatagram>(bytes)),

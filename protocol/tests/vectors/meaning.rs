@@ -2,20 +2,21 @@
 
 use nalgebra::{SVector, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
-use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid};
+use telemime_protocol::checkpoint::path::PathDecoder;
 use telemime_protocol::checkpoint::{Checkpoint, Grid, Plan, PosePlan};
 use telemime_protocol::pose;
 use telemime_protocol::predict::{Forecast, TurnForecast, TurnState, checksum};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::codec;
+use telemime_protocol::wire::knots::KnotBlock;
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::WireTurn;
 use telemime_protocol::wire::v1::*;
-use telemime_protocol::wire::{codec, knots};
 
 use super::Vector;
 use super::draw::Draw;
-use super::messages::{BOUND_UM, path_knots};
+use super::messages::{BOUND_UM, code, path_knots};
 
 fn v3(v: &Vector3<f64>) -> Value {
     json!([v.x, v.y, v.z])
@@ -86,12 +87,8 @@ pub(crate) fn moving(i: u32) -> Motion {
             grip: None,
         },
         first_knot: 0,
-        knots: motion_without_knots(),
+        knots: KnotBlock::default(),
     }
-}
-
-fn motion_without_knots() -> Vec<WireKnot> {
-    Vec::new()
 }
 
 fn states(all: &mut Vec<Vector>) {
@@ -151,30 +148,39 @@ fn turns(all: &mut Vec<Vector>) {
 
 fn paths(all: &mut Vec<Vector>) {
     let draw = &mut Draw::new(4);
-    let grid = PathGrid::for_bound(f64::from(BOUND_UM) * 1e-6).expect("a usable bound");
-    for (i, n) in [1, 2, 5, 32, 100].into_iter().enumerate() {
+    let code = code();
+    for (i, (before, n)) in [(0, 1), (0, 2), (1, 1), (3, 5), (8, 32), (20, 100)]
+        .into_iter()
+        .enumerate()
+    {
         let state = moving(i as u32).state;
-        let sent = path_knots(draw, &state, n);
+        let all_knots = path_knots(draw, &state, before + n);
+        let (held, sent) = all_knots.split_at(before);
         let tail = PathTail {
             engagement: 1,
             state,
-            first_knot: 0,
-            knots: knots::pack(&state, grid, &sent).expect("a path before the state"),
+            first_knot: before as u32,
+            knots: KnotBlock::pack(&state, code, held, sent).expect("a path before the state"),
         };
-        let mut path = PathDecoder::new(grid, n);
-        sent.iter()
-            .for_each(|k| path.append(k).expect("a path in order"));
-        let told: Vec<_> = sent
+        let unpacked = tail.knots.unpack(&state, code, held, MAX_TAIL_KNOTS);
+        assert_eq!(unpacked.as_deref(), Ok(sent));
+        let mut path = PathDecoder::new(code.grid, before + n);
+        let told: Vec<_> = all_knots
             .iter()
-            .map(|k| json!([k.tick, k.x, k.v, k.start]))
+            .map(|k| {
+                path.append(k).expect("a path in order");
+                json!([k.tick, k.x, k.v, k.start])
+            })
             .collect();
         let mut at = Vec::new();
-        for w in sent.windows(2).filter(|w| !w[1].start) {
+        for w in all_knots.windows(2).filter(|w| !w[1].start) {
             let t = Stamp((w[0].tick * 3 + w[1].tick) * 10_000 / 4);
             let jet = path.eval(t).expect("between joined knots");
             at.push(json!({"t_ns": t.0, "x": v3(&jet.x), "v": v3(&jet.v)}));
         }
-        let value = json!({"path_bound_um": BOUND_UM, "knots": told, "at": at});
+        let value = json!({
+            "path_bound_um": BOUND_UM, "sample_us": code.sample_us, "before": before, "knots": told, "at": at,
+        });
         all.push(says("path", i, OperatorControl::Path(tail).encode(), value));
     }
 }

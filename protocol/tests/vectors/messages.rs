@@ -4,9 +4,10 @@ use serde::Serialize;
 use serde_json::json;
 use telemime_protocol::checkpoint::path::{PathGrid, PathKnot, tick_of};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
+use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::v1::*;
-use telemime_protocol::wire::{codec, frame, knots};
+use telemime_protocol::wire::{codec, frame};
 
 use super::Vector;
 use super::draw::Draw;
@@ -158,21 +159,37 @@ const REASONS: [Refusal; 11] = [
 
 pub(crate) const BOUND_UM: u32 = 20_000;
 
+/// What a path is coded with.
+pub(crate) fn code() -> PathCode {
+    PathCode {
+        grid: PathGrid::for_bound(f64::from(BOUND_UM) * 1e-6).expect("a usable bound"),
+        sample_us: 33_333,
+    }
+}
+
 /// A path of `n` knots that ends shortly before the state.
 pub(crate) fn path_knots(draw: &mut Draw, state: &WireState, n: usize) -> Vec<PathKnot> {
-    let grid = PathGrid::for_bound(f64::from(BOUND_UM) * 1e-6).expect("a usable bound");
     let s = state.dequantise();
     let mut tick = tick_of(s.t) - 30_000 * n as i64;
-    let mut x: [i32; 3] = (s.x / grid.step_m()).map(|v| v.round() as i32).into();
+    let mut x: [i32; 3] = (s.x / code().grid.step_m())
+        .map(|v| v.round() as i32)
+        .into();
     (0..n)
         .map(|i| {
-            tick += 1 + draw.bits(14) as i64;
+            let span = 1 + draw.bits(14) as i64;
+            tick += span;
             x = x.map(|v| v + draw.signed(6) as i32);
+            let start = i == 0 || draw.below(8) == 0;
+            let shift = if start {
+                1
+            } else {
+                PathGrid::<3>::slope_shift(span)
+            };
             PathKnot {
                 tick,
                 x,
-                v: std::array::from_fn(|_| draw.signed(5) as i32),
-                start: i == 0 || draw.below(8) == 0,
+                v: std::array::from_fn(|_| (draw.signed(5) as i32) << shift),
+                start,
             }
         })
         .collect()
@@ -186,12 +203,12 @@ fn engage(draw: &mut Draw, drive: Drive) -> OperatorControl {
         scale: [0.125, 1.0, 10.0][draw.below(3)],
         rotation: [[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.5, -0.5]][draw.below(2)],
         path_bound_um: 1 + draw.bits(31) as u32,
+        sample_us: 1 + draw.bits(19) as u32,
         lease_ms: draw.u16(),
     })
 }
 
 fn motion(draw: &mut Draw, knot_count: usize) -> Motion {
-    let grid = PathGrid::for_bound(f64::from(BOUND_UM) * 1e-6).expect("a usable bound");
     let state = draw.state();
     let path = path_knots(draw, &state, knot_count);
     Motion {
@@ -205,7 +222,7 @@ fn motion(draw: &mut Draw, knot_count: usize) -> Motion {
         state,
         pose: draw.pose(),
         first_knot: draw.u32(),
-        knots: knots::pack(&state, grid, &path).expect("a path before the state"),
+        knots: KnotBlock::pack(&state, code(), &[], &path).expect("a path before the state"),
     }
 }
 

@@ -4,6 +4,7 @@ use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::{Skill, SkillError, example};
 use telemime_protocol::wire::frame::{Deframer, MAX_FRAME_LEN};
 use telemime_protocol::wire::hello::{Answer, Hello, HelloError};
+use telemime_protocol::wire::knots::KnotBlock;
 use telemime_protocol::wire::v1::*;
 use telemime_protocol::wire::{DecodeError, codec};
 
@@ -133,12 +134,14 @@ fn control(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
             scale: 0.125,
             rotation: [0.5, -0.5, 0.5, -0.5],
             path_bound_um: 200,
+            sample_us: 200,
             lease_ms: 200,
         })
     };
     let play = engage(Drive::Play { plan: 1 }).encode();
-    // From the end: lease 1, bound 1, rotation 16, scale 4.
-    let (bound, rotation, scale) = (play.len() - 2, play.len() - 18, play.len() - 22);
+    // From the end: lease 1, samples 1, bound 1, rotation 16, scale 4.
+    let from_end = |n| play.len() - n;
+    let (samples, bound, rotation, scale) = (from_end(2), from_end(3), from_end(19), from_end(23));
     let scaled = |v: f32| {
         let mut bytes = play.clone();
         bytes[scale..scale + 4].copy_from_slice(&v.to_le_bytes());
@@ -193,6 +196,12 @@ fn control(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
         OPERATOR_CONTROL,
         "engage, no path bound",
         with(play.clone(), bound, 0),
+        "Invalid",
+    );
+    say(
+        OPERATOR_CONTROL,
+        "engage, no interval of samples",
+        with(play.clone(), samples, 0),
         "Invalid",
     );
     let mut mirror = moving(1);
@@ -369,6 +378,16 @@ fn datagrams(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
     );
     let endless = [&good[..good.len() - 1], &[0xfd, 0, 0, 0, 0, 0, 0, 0, 1]].concat();
     say(OPERATOR_DATAGRAM, "2^56 knots", endless, "Malformed");
+    // One of n + 1 zeros, a one and n bits: 33 less one, in a motion.
+    let many = sent(|m| m.knots = KnotBlock(vec![0b0000_0100, 0b0010_0000]));
+    say(OPERATOR_DATAGRAM, "33 knots", many, "Invalid");
+    let endless = sent(|m| m.knots = KnotBlock(vec![0; 9]));
+    say(
+        OPERATOR_DATAGRAM,
+        "a number of knots that has no end",
+        endless,
+        "Invalid",
+    );
     let telemetry = |q: Vec<f32>, tip| {
         RobotDatagram::Telemetry(Telemetry {
             epoch: 7,

@@ -239,6 +239,7 @@ impl Bench {
             scale: 0.5,
             rotation: [1.0, 0.0, 0.0, 0.0],
             path_bound_um: 20_000,
+            sample_us: 33_333,
             lease_ms: 650,
         });
         self.control(engage.encode());
@@ -262,7 +263,7 @@ impl Bench {
             state: self.state(input, ms_ago),
             pose: Default::default(),
             first_knot: 0,
-            knots: Vec::new(),
+            knots: Default::default(),
         });
         self.datagram(&motion.encode());
     }

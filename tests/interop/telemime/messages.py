@@ -1,12 +1,28 @@
 """Every message of version 1 (§4, §5), field by field."""
 
-from .codec import (F32, I32, I64, U8, U16, U32, Array, Bytes, Enum, Option, Struct, Text, Vec, decode, encode, finite, require)
+from . import path
+from .codec import (F32, I64, U8, U16, U32, Array, Bytes, Enum, Option, Struct, Text, Vec, WireError, decode, encode, finite, require)
 from .frames import LONGEST
 from .state import PARAMS, POSE, ROTATION, STATE, _rotation_range
 
 DATAGRAM = 1100
 ID = Array(U8, 16)
-KNOT = Struct(("dt", U32), ("dx", Array(I32, 3)), ("v", Array(I32, 3)))
+
+
+class Knots(Bytes):
+    """Knots as bits: a block's number of knots is looked at with the message, all else once the path before it is there."""
+
+    def __init__(self, most):
+        super().__init__(DATAGRAM if most == 32 else LONGEST)
+        self.knots = most
+
+    def check(self, value):
+        try:
+            n = path.count(value)
+        except WireError as e:
+            raise WireError("Invalid", str(e)) from None
+        require(n <= self.knots, "knots", n)
+
 
 STATES = Enum("Idle", "Ready", "Engaged", "Coasting", "Holding", "Stopped")
 CAUSES = Enum(
@@ -24,6 +40,7 @@ def _engage(m):
     require(0 < m["scale"] <= 10, "scale", m["scale"])
     require(abs(sum(c * c for c in m["rotation"]) - 1) <= 1e-3, "rotation", m["rotation"])
     require(m["path_bound_um"] > 0, "path_bound_um", 0)
+    require(1 <= m["sample_us"] <= 1_000_000, "sample_us", m["sample_us"])
 
 
 def _info(m):
@@ -54,8 +71,8 @@ OPERATOR_CONTROL = Enum(
     ("Plan", Struct(("id", U32), ("bytes", Bytes(131_072)))),
     ("Engage", Struct(
         ("engagement", U32), ("t_us", I64), ("drive", DRIVE), ("scale", F32), ("rotation", Array(F32, 4)),
-        ("path_bound_um", U32), ("lease_ms", U16), check=_engage)),
-    ("Path", Struct(("engagement", U32), ("state", STATE), ("first_knot", U32), ("knots", Vec(KNOT, 1024)))),
+        ("path_bound_um", U32), ("sample_us", U32), ("lease_ms", U16), check=_engage)),
+    ("Path", Struct(("engagement", U32), ("state", STATE), ("first_knot", U32), ("knots", Knots(1024)))),
     ("Release", Struct(("engagement", U32))),
     "EmergencyStop",
     ("Reset", Struct(("changes", U32))),
@@ -76,7 +93,7 @@ ROBOT_CONTROL = Enum(
 OPERATOR_DATAGRAM = Enum(
     ("Motion", Struct(
         ("epoch", U32), ("engagement", U32), ("seq", U32), ("lease_ms", U16), ("model", U16), ("params", PARAMS),
-        ("checksum", Option(U32)), ("state", STATE), ("pose", POSE), ("first_knot", U32), ("knots", Vec(KNOT, 32)))),
+        ("checksum", Option(U32)), ("state", STATE), ("pose", POSE), ("first_knot", U32), ("knots", Knots(32)))),
     ("Go", Struct(("epoch", U32), ("engagement", U32), ("seq", U32), ("t_us", I64), ("lease_ms", U16))),
     ("Pong", Struct(("epoch", U32), ("t1_us", I64), ("t2_us", I64), ("t3_us", I64))),
     ("Stop", Struct(("epoch", U32))),

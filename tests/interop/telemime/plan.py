@@ -3,60 +3,12 @@
 import math
 
 from . import spline
-from .codec import Bytes, Kind, Option, Struct, WireError, require, unzigzag, zigzag
+from .bits import BitReader, BitWriter
+from .codec import Bytes, Kind, Option, Struct, WireError, require, zigzag
 
 MOST, FAR = 4096, 1 << 30
 LONGEST = 131_072
 BYTES = Bytes(LONGEST)
-
-
-class BitReader:
-    def __init__(self, data):
-        self.data, self.at = data, 0
-
-    def bits(self, n):
-        value = 0
-        for _ in range(n):
-            if self.at == 8 * len(self.data):
-                raise WireError("Malformed", "bits wanted after the end")
-            value = value << 1 | self.data[self.at // 8] >> 7 - self.at % 8 & 1
-            self.at += 1
-        return value
-
-    def golomb(self, k):
-        zeros = 0
-        while not self.bits(1):
-            zeros += 1
-            if zeros > 40:
-                raise WireError("Malformed", "a number beyond 2^40")
-        q = 1 << zeros | self.bits(zeros)
-        n = q - 1 << k | self.bits(k)
-        if n >= 1 << 40:
-            raise WireError("Malformed", "a number beyond 2^40")
-        return n
-
-    def signed(self, k):
-        return unzigzag(self.golomb(k))
-
-
-class BitWriter:
-    def __init__(self):
-        self.value, self.n = 0, 0
-
-    def bits(self, value, n):
-        self.value, self.n = self.value << n | value, self.n + n
-
-    def golomb(self, n, k):
-        q = (n >> k) + 1
-        self.bits(q, 2 * q.bit_length() - 1)
-        self.bits(n & (1 << k) - 1, k)
-
-    def signed(self, n, k):
-        self.golomb(zigzag(n), k)
-
-    def bytes(self):
-        fill = -self.n % 8
-        return (self.value << fill).to_bytes((self.n + fill) // 8, "big")
 
 
 def cost(n, k):
@@ -104,8 +56,7 @@ def unpack(data, dims):
         points.append((t, values))
     plan = {"step_nm": step, "tick_us": tick, "points": points}
     check(plan)
-    if r.at + 7 < 8 * len(data):
-        raise WireError("Malformed", "bytes after the last point")
+    r.end()
     return plan
 
 
