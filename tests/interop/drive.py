@@ -38,8 +38,8 @@ def identity():
 class Robot:
     """A `telemime robot` process and what it prints."""
 
-    def __init__(self, program, folder, peer):
-        command = [program, "robot", "--listen", "127.0.0.1:0", "--json", "--peer", peer]
+    def __init__(self, program, folder, peer, *more):
+        command = [program, "robot", "--listen", "127.0.0.1:0", "--json", "--peer", peer, *more]
         self.process = subprocess.Popen(
             command + ["--identity", str(folder / "robot.key")], stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True
         )
@@ -126,7 +126,9 @@ class Hand:
 async def session(robot, key, certificate):
     async with dial(robot.host, robot.port, key, certificate, robot.fingerprint) as operator:
         operator.greet()
-        print("greeted:", await operator.hear("HelloAck"))
+        greeted = await operator.hear("HelloAck")
+        print("greeted:", greeted)
+        assert greeted["version"] == 1, greeted
         print("info:   ", await operator.hear("Info"))
         while operator.pings < 8:
             await asyncio.sleep(0.02)
@@ -193,6 +195,14 @@ async def turned_away(robot, key, certificate):
         assert answer["code"] == 1, answer
         print("a version of the future:", answer)
         await operator.hear("Closed")
+    # One that speaks later versions too is answered in the first.
+    async with dial(robot.host, robot.port, key, certificate, robot.fingerprint) as operator:
+        operator.greet(1, 99)
+        answer = await operator.hear("HelloAck")
+        assert answer["version"] == 1, answer
+        await operator.hear("Info")
+        operator.say("Goodbye", end=True)
+        await operator.hear("Closed")
     stranger = identity()
     try:
         async with dial(robot.host, robot.port, *stranger, robot.fingerprint) as operator:
@@ -207,13 +217,14 @@ async def turned_away(robot, key, certificate):
 
 def main():
     key, certificate = identity()
-    with tempfile.TemporaryDirectory() as folder:
-        robot = Robot(sys.argv[1], pathlib.Path(folder), fingerprint(certificate))
-        try:
-            asyncio.run(turned_away(robot, key, certificate))
-            asyncio.run(session(robot, key, certificate))
-        finally:
-            robot.end()
+    # A robot of today, and one that speaks version 2 as well.
+    for more, play in [((), turned_away), (("--protocol-max", "2"), session)]:
+        with tempfile.TemporaryDirectory() as folder:
+            robot = Robot(sys.argv[1], pathlib.Path(folder), fingerprint(certificate), *more)
+            try:
+                asyncio.run(play(robot, key, certificate))
+            finally:
+                robot.end()
     print("a robot and an operator of two makes work together")
 
 
