@@ -6,7 +6,7 @@ import document
 from telemime import codec, frames, greeting, lease, messages, path, plan, predict, rotation, skill, spline, state
 
 STATE = bytes.fromhex("fc808d5b00 fb401ffb9f0ffb50c3 050afc0018f70132ec0250e205")
-PARAMS = {"gain": 255, "trust": 230, "cv_damping": 128}
+PARAMS = {"gain": 255, "inflation": 136, "weights": [[230, 10, 10], [180, 40, 30], [128, 60, 50]]}
 
 
 def hand():
@@ -142,13 +142,19 @@ class Document(unittest.TestCase):
         apart = [predict.sub(h.x, m) for m in h.m]
         novelty = model.respond(h.x + sum(apart, []))[2]
         self.near(says["novelty"], [novelty])
-        self.near(says["weight"], [model.share(PARAMS["trust"] / 255, novelty)])
+        self.near(says["familiarity"], [model.familiarity(novelty)])
         self.near(says["mixture(3)"], model.mixture(h.x + sum(apart, []))[0][2])
+        generic = [sum(f * m[i] for f, m in zip(s["predictor"]["lead"][2], apart)) for i in range(3)]
+        self.near(says["generic(3)"], generic)
+        self.near(says["straight(3)"], predict.straight(predict.velocity(apart)[0], 0.1, predict.PLACE[1]))
         f = predict.place(h, PARAMS, model)
         d, sigma = f.at(0.1)
-        self.near(says["blend(0.1)"], [x + c for x, c in zip(h.x, d)])
-        self.near(says["blend sigma(0.1)"], [sigma])
-        self.assertEqual(says["blend checksum"], [f"{predict.checksum(h, f):08x}"])
+        self.near(says["fused(0.1)"], [x + c for x, c in zip(h.x, d)])
+        v = f.covariance[3]
+        self.near(says["fused V(3) diagonal"], [v[0], v[3], v[5]])
+        self.near(says["fused V(3) xy xz yz"], [v[1], v[2], v[4]])
+        self.near(says["fused sigma(0.1)"], [sigma])
+        self.assertEqual(says["fused checksum"], [f"{predict.checksum(h, f):08x}"])
 
 
 def example():
@@ -178,8 +184,9 @@ def example():
         "name": "wave", "duration_s": 2.0, "pace": [0.75, 0.125],
         "motion": [{"weight": 1.0, "mean": [1.0, 0.5, 0.0, 2.0], "covariance": sum(unit, [])}],
         "predictor": {
-            "mean": [0.0] * 15, "scale": [0.5] * 15, "covariance": [2.0] * j, "straight_m2": [0.25] * j, "novelty90": 16.0,
-            "params": [1.0, 1.0, 0.5], "exponents": e,
+            "mean": [0.0] * 15, "scale": [0.5] * 15, "covariance": [2.0] * j, "novelty90": 16.0,
+            "errors": [[0.03125, 0.0625, 0.25, 0.5]] * j, "lead": [[0.5 * k, 0.0, 0.125 * k, 0.0] for k in range(1, j + 1)],
+            "products": [0.25] * 10, "exponents": e,
             "components": [component(0.75, 0, 0.125, 0.25), component(0.25, 1, -0.0625, 0.5)],
         },
         "turn": None, "grip": None, "task": None,

@@ -6,8 +6,10 @@ from . import rotation, skill
 from .codec import round_away
 from .state import TAU
 
-NOISE, TURN_NOISE = 0.25, 1.0
-CONSTANT_KNOTS = 24
+# Of a place and of an orientation: what constant velocity adds to its variance, and how far it goes at most.
+PLACE, TURN = (0.25, 0.3), (1.0, 1.0)
+CONSTANT_KNOTS, BANDS = 24, (3, 6, 12)
+SYMMETRIC, IDENTITY = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), (1, 0, 0, 1, 0, 1)
 
 
 def sub(a, b):
@@ -19,10 +21,10 @@ def norm2(a):
 
 
 class Forecast:
-    """Displacements and deviations at knots 1/30 s apart."""
+    """Displacements, deviations and covariances at knots 1/30 s apart."""
 
-    def __init__(self, d, sigma):
-        self.d, self.sigma = d, sigma
+    def __init__(self, d, sigma, covariance):
+        self.d, self.sigma, self.covariance = d, sigma, covariance
 
     def at(self, h):
         """(displacement, deviation) at horizon h (s)."""
@@ -81,24 +83,32 @@ class Model:
         total = sum(r)
         return [a / total for a in r], apart, novelty
 
-    def share(self, trust, novelty):
-        """w: the mixture's share in the forecast."""
-        ratio = novelty / (8 * self.p["novelty90"])
-        return trust / (1 + ratio * ratio)
+    def familiarity(self, novelty):
+        """F: how much of the mixture's weight is left."""
+        ratio = novelty / (6 * self.p["novelty90"])
+        return 1 / (1 + ratio * ratio)
 
     def mixture(self, features):
-        """(g, trace of V, novelty), g and trace knot by knot."""
+        """(g, V, novelty): displacements and covariances, the latter as (xx, xy, xz, yy, yz, zz), knot by knot."""
         weights, apart, novelty = self.respond(features)
         told = []
         for r, c, e in zip(weights, self.components, apart):
-            y = [[c["target"][i][j] + sum(c["gain"][a][i][j] * e[a] for a in range(15)) for i in range(3)] for j in range(self.knots)]
+            y = [
+                [c["target"][i][j] + sum(c["gain"][a][i][j] * e[a] for a in range(15)) for i in range(3)]
+                for j in range(self.knots)
+            ]
             told.append((r, y, c["residual"]))
         g = [[sum(r * y[j][i] for r, y, _ in told) for i in range(3)] for j in range(self.knots)]
-        trace = [
-            sum(r * (sum(res[i][j] for i in (0, 3, 5)) + norm2(sub(y[j], g[j]))) for r, y, res in told)
+        v = [
+            [sum(r * (res[n][j] + outer(sub(y[j], g[j]))[n]) for r, y, res in told) for n in range(6)]
             for j in range(self.knots)
         ]
-        return g, trace, novelty
+        return g, v, novelty
+
+
+def outer(d):
+    """d·dᵀ, as (xx, xy, xz, yy, yz, zz)."""
+    return [d[a] * d[b] for a, b in SYMMETRIC]
 
 
 def velocity(apart):
@@ -108,36 +118,70 @@ def velocity(apart):
     return [s + b * TAU[0] for s, b in zip(s1, a)], a
 
 
-def _forecast(apart, params, model, features, noise):
-    gain, trust, damping = (params[name] / 255 for name in ("gain", "trust", "cv_damping"))
+def weights_at(params, j):
+    """Of mixture, generic extrapolator and straight line at knot j."""
+    rows = [[n / 255 for n in row] for row in params["weights"]]
+    for (a, first), (b, last) in zip(zip(BANDS, rows), zip(BANDS[1:], rows[1:])):
+        if j <= b:
+            u = max(j - a, 0) / (b - a)
+            return [(1 - u) * p + u * q for p, q in zip(first, last)]
+    return rows[-1]
+
+
+def straight(v, h, reach):
+    """What the straight line says of horizon h: no farther than `reach`."""
+    return [c * h / math.sqrt(1 + norm2(v) * h * h / (reach * reach)) for c in v]
+
+
+def fuse(params, j, weights, told, covariances):
+    """(displacement, covariance) at knot j of experts with these weights."""
+    h, gain, inflation = j / 30, params["gain"] / 255, 2.0 ** ((params["inflation"] - 128) / 8)
+    mean = [sum(w * y[i] for w, y in zip(weights, told)) for i in range(3)]
+    v = [0.0] * 6
+    for w, y, c in zip(weights, told, covariances):
+        v = [a + w * (b + d) for a, b, d in zip(v, c, outer(sub(y, mean)))]
+    return [gain * m for m in mean], [inflation * (a + e * 1e-4 * h * h) for a, e in zip(v, IDENTITY)]
+
+
+def _forecast(apart, params, model, features, kind):
+    noise, reach = kind
     v, a = velocity(apart)
-    if model is None:
-        d, sigma = [[0.0] * 3], [0.0]
-        for j in range(1, CONSTANT_KNOTS + 1):
-            h = j / 30
-            d.append([c * (damping * h * gain) for c in v])
-            sigma.append(h * math.sqrt((norm2(v) + noise + 0.25 * norm2(a) * h * h) / 3))
-        return Forecast(d, sigma)
-    g, trace, novelty = model.mixture(features)
-    w = model.share(trust, novelty)
-    d, sigma = [[0.0] * 3], [0.0]
-    for j in range(model.knots):
-        h = (j + 1) / 30
-        straight = [c * damping * h for c in v]
-        mean = g[j] if w > 0 else straight
-        share = w if w > 0 else 0.0
-        d.append([gain * (share * m + (1 - share) * s) for m, s in zip(mean, straight)])
-        apart2 = norm2(sub(mean, straight))
-        sigma.append(math.sqrt(
-            share * model.p["covariance"][j] * trace[j] / 3
-            + (1 - share) * (model.p["straight_m2"][j] + share * apart2 / 3)))  # fmt: skip
-    return Forecast(d, sigma)
+    d, sigma, covariance = [[0.0] * 3], [0.0], [[0.0] * 6]
+    if model:
+        g, spread, novelty = model.mixture(features)
+        known = model.familiarity(novelty)
+        if not known > 0:
+            known, g, spread = 0.0, [[0.0] * 3] * model.knots, [[0.0] * 6] * model.knots
+        moved, usual = norm2(apart[2]), model.p["products"][5]
+        scatter = (moved + usual / 10) / (usual + usual / 10)
+    for j in range(1, (model.knots if model else CONSTANT_KNOTS) + 1):
+        h = j / 30
+        line, weights = straight(v, h, reach), weights_at(params, j)
+        if model:
+            w_m, others = weights[0], [*weights[1:], max(0.0, 1 - sum(weights))]
+            s = w_m * (1 - known) / (sum(others) + 3 / 255)
+            weights = [w_m * known, *(w + s * (w + 1 / 255) for w in others)]
+            generic = [sum(f * m[i] for f, m in zip(model.p["lead"][j - 1], apart)) for i in range(3)]
+            told = [g[j - 1], generic, line, [0.0] * 3]
+            errors = model.p["errors"][j - 1]
+            covariances = [[model.p["covariance"][j - 1] * c for c in spread[j - 1]]]
+            covariances += [[e * errors[k] * scatter for e in IDENTITY] for k in (1, 2, 3)]
+        else:
+            w_s = weights[2] + 0.5 * (weights[0] + weights[1])
+            weights, told = [w_s, 1 - w_s], [line, [0.0] * 3]
+            c = h * h * (norm2(v) + noise + 0.25 * norm2(a) * h * h) / 3
+            covariances = [[e * c for e in IDENTITY]] * 2
+        mean, c = fuse(params, j, weights, told, covariances)
+        d.append(mean)
+        covariance.append(c)
+        sigma.append(math.sqrt((c[0] + c[3] + c[5]) / 3))
+    return Forecast(d, sigma, covariance)
 
 
 def place(hand, params, model=None):
     """The forecast of a hand state's place; without a model, constant velocity."""
     apart = [sub(hand.x, m) for m in hand.m]
-    return _forecast(apart, params, model, hand.x + sum(apart, []), NOISE)
+    return _forecast(apart, params, model, hand.x + sum(apart, []), PLACE)
 
 
 def turning(turn, params, model=None):
@@ -148,7 +192,7 @@ def turning(turn, params, model=None):
         features = [
             rotation.log(rotation.mul(rotation.inverse(chart), turn.q)) + sum(apart, []) for chart in model.charts
         ]
-    return _forecast(apart, params, model, features, TURN_NOISE)
+    return _forecast(apart, params, model, features, TURN)
 
 
 def checksum(hand, forecast, turn_forecast=None):

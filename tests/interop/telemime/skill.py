@@ -65,12 +65,13 @@ COMPONENT = Struct(
 
 def _predictor(p):
     j = len(p["covariance"])
-    finite("predictor", p["mean"], p["scale"], p["covariance"], p["straight_m2"], p["novelty90"], p["params"])
-    for name in ("scale", "covariance", "straight_m2"):
+    finite("predictor", *(p[k] for k in ("mean", "scale", "covariance", "errors", "novelty90", "lead", "products")))
+    for name in ("scale", "covariance"):
         require(all(v > 0 for v in p[name]), name, p[name])
+    require(all(v > 0 for row in p["errors"] for v in row), "errors", p["errors"])
+    require(all(p["products"][i * (i + 3) // 2] > 0 for i in range(4)), "products", p["products"])
     require(p["novelty90"] > 0, "novelty90", p["novelty90"])
-    require(all(0 <= v <= 1 for v in p["params"]), "params", p["params"])
-    require(len(p["straight_m2"]) == j and len(p["exponents"]) == j, "lengths", j)
+    require(all(len(p[name]) == j for name in ("errors", "lead", "exponents")), "lengths", j)
     require(all(-40 <= e <= 20 for e in p["exponents"]), "exponents", p["exponents"])
     for c in p["components"]:
         require(math.isfinite(c["weight"]) and c["weight"] > 0, "weight", c["weight"])
@@ -84,7 +85,8 @@ def _predictor(p):
 
 PREDICTOR = Struct(
     ("mean", Array(F32, FEATURES)), ("scale", Array(F32, FEATURES)), ("covariance", Vec(F32, KNOTS, 1)),
-    ("straight_m2", Vec(F32, KNOTS, 1)), ("novelty90", F32), ("params", Array(F32, 3)), ("exponents", Vec(I8, KNOTS, 1)),
+    ("errors", Vec(Array(F32, 4), KNOTS, 1)), ("novelty90", F32), ("lead", Vec(Array(F32, 4), KNOTS, 1)),
+    ("products", Array(F32, 10)), ("exponents", Vec(I8, KNOTS, 1)),
     ("components", Vec(COMPONENT, COMPONENTS, 1)), check=_predictor)  # fmt: skip
 
 

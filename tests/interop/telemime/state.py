@@ -24,7 +24,13 @@ def _turn_ranges(s):
     require(s["memory_exponent"] <= 10, "memory_exponent", s["memory_exponent"])
 
 
-PARAMS = Struct(("gain", U8), ("trust", U8), ("cv_damping", U8))
+
+
+def _weights(p):
+    require(all(sum(row) <= 255 for row in p["weights"]), "weights", p["weights"])
+
+
+PARAMS = Struct(("gain", U8), ("inflation", U8), ("weights", Array(Array(U8, 3), 3)), check=_weights)
 ROTATION = Array(I16, 3)
 STATE = Struct(
     ("t_us", I64), ("x", Array(I32, 3)), ("memory_exponent", U8), ("memory", Array(Array(I8, 3), 4)), check=_state_ranges
