@@ -3,7 +3,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use telemime_protocol::predict::{HandState, TurnState, checksum};
+use telemime_protocol::predict::{HandState, Params, TurnState, checksum};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 
@@ -15,7 +15,7 @@ fuzz_target!(|bytes: &[u8]| {
     assert!(skill.motion().log_density(&[0.5, 0.0, 0.0, 0.0].into()) <= f64::MAX);
     let mut hand = HandState::first(Stamp(0), [0.1, 0.2, 2.0].into());
     hand.advance(Stamp(33_000_000), [0.12, 0.19, 2.0].into());
-    let params = skill.predictor().calibration().params;
+    let params = Params::default();
     let place = skill.predictor().forecast(&hand, &params);
     let turn = skill.turn().map(|turn| {
         let state = TurnState::first(Stamp(0), Default::default());

@@ -67,8 +67,12 @@ impl Draw {
     pub(crate) fn params(&mut self) -> WireParams {
         WireParams {
             gain: self.u8(),
-            trust: self.u8(),
-            cv_damping: self.u8(),
+            inflation: self.u8(),
+            weights: std::array::from_fn(|_| {
+                let first = self.u8();
+                let second = (self.u8()).min(255 - first);
+                [first, second, (255 - first - second) / 2]
+            }),
         }
     }
 

@@ -369,6 +369,12 @@ fn datagrams(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
         sent(|m| m.pose.turn.as_mut().expect("it turns").memory_exponent = 11),
         "Invalid",
     );
+    say(
+        OPERATOR_DATAGRAM,
+        "weights of more than 1",
+        sent(|m| m.params.weights[2] = [200, 50, 6]),
+        "Invalid",
+    );
     // The last three bytes: no gripper, knot 0, no knots.
     say(
         OPERATOR_DATAGRAM,

@@ -218,10 +218,11 @@ impl Bench {
 
     fn engage(&mut self, input: &mut Input<'_>) {
         let (engagement, ms_ago) = (input.byte().into(), input.byte());
+        let weights = [[0, 0, input.byte()]; 3];
         let params = WireParams {
             gain: 255,
-            trust: 255,
-            cv_damping: input.byte(),
+            inflation: 128,
+            weights,
         };
         let drive = match engagement % 8 {
             7 => Drive::Play { plan: 1 },
@@ -256,8 +257,8 @@ impl Bench {
             model: 0,
             params: WireParams {
                 gain: 255,
-                trust: 0,
-                cv_damping: input.byte(),
+                inflation: 128,
+                weights: [[0, 0, input.byte()]; 3],
             },
             checksum: None,
             state: self.state(input, ms_ago),
