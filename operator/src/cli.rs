@@ -119,6 +119,9 @@ pub struct Args {
     /// Give up if the robot is not reached within this time, s [default: 10].
     #[arg(long, value_name = "S")]
     pub patience: Option<f64>,
+    /// Offer protocol versions up to this one; 2 is an experiment [default: 1].
+    #[arg(long, value_name = "N")]
+    pub protocol_max: Option<u16>,
     /// Seed of learning.
     #[arg(long)]
     pub seed: Option<u64>,
@@ -256,6 +259,7 @@ struct File {
     lease_s: Option<f64>,
     rest_s: Option<f64>,
     patience_s: Option<f64>,
+    protocol_max: Option<u16>,
     seed: Option<u64>,
 }
 
@@ -322,6 +326,7 @@ impl Args {
         self.lease = self.lease.or(file.lease_s);
         self.rest = self.rest.or(file.rest_s);
         self.patience = self.patience.or(file.patience_s);
+        self.protocol_max = self.protocol_max.or(file.protocol_max);
         self.seed = self.seed.or(file.seed);
         Ok(self)
     }
@@ -339,6 +344,7 @@ impl Args {
             gain: self.gain.unwrap_or(defaults.gain),
             scale: self.scale,
             rotation: self.axes.unwrap_or_default().rotation(),
+            versions: telemime_endpoint::cli::versions(self.protocol_max)?,
         };
         let within = |name: &str, value: f64, low: f64, high: f64| -> anyhow::Result<()> {
             if !(value > low && value <= high) {

@@ -15,10 +15,9 @@ use telemime_endpoint::meter::Counts;
 use telemime_endpoint::{HostClock, Meter, Mono, quic};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
-use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::frame::Frame;
-use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
-use telemime_protocol::wire::v1;
+use telemime_protocol::wire::hello::{Answer, RejectCode};
+use telemime_protocol::wire::{DecodeError, Version};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{sleep_until, timeout};
 
@@ -118,6 +117,8 @@ pub enum Notice {
     Connected {
         /// Its epoch.
         epoch: u32,
+        /// The protocol version both speak.
+        version: Version,
     },
     /// The connection was lost.
     Lost {
@@ -164,6 +165,7 @@ struct Link {
     writer: Writer,
     frames: mpsc::Receiver<Result<Frame, ControlError>>,
     epoch: u32,
+    version: Version,
 }
 
 /// What the person at the terminal says.
@@ -248,8 +250,12 @@ impl Daemon {
             };
             let Some(link) = link else { break };
             summary.sessions += 1;
-            let _ = notices.send(Notice::Connected { epoch: link.epoch });
+            let _ = notices.send(Notice::Connected {
+                epoch: link.epoch,
+                version: link.version,
+            });
             let mut session = Session::new(self.config, lessons.skill(), link.epoch)
+                .speaking(link.version)
                 .watched_by(self.recogniser.clone());
             marks.requests = 0;
             if stop {
@@ -349,30 +355,28 @@ impl Daemon {
             .await
             .map_err(|e| DialError::Again(quic::explain(&e)))?;
         let mut control = Control::open(&connection).await.map_err(again)?;
-        let hello = Hello {
-            min: v1::VERSION,
-            max: v1::VERSION,
-            features: 0,
-        };
-        control.write(&hello.encode()).await.map_err(again)?;
+        let offered = self.config.versions;
+        control
+            .write(&offered.hello().encode())
+            .await
+            .map_err(again)?;
         match control.answer().await.map_err(again)? {
-            Answer::Ack {
-                version: v1::VERSION,
-                epoch,
-                ..
-            } => {
+            Answer::Ack { version, epoch, .. } => {
+                let Some(version) = offered.known(version) else {
+                    return Err(DialError::Rejected {
+                        code: RejectCode::Version,
+                        text: format!("it answers with version {version}, which we did not offer"),
+                    });
+                };
                 let (writer, frames) = control.into_frames();
                 Ok(Link {
                     connection,
                     writer,
                     frames,
                     epoch,
+                    version,
                 })
             }
-            Answer::Ack { version, .. } => Err(DialError::Rejected {
-                code: RejectCode::Version,
-                text: format!("it answers with version {version}, which we did not offer"),
-            }),
             Answer::Reject { code, text } => Err(DialError::Rejected { code, text }),
         }
     }

@@ -61,6 +61,9 @@ pub struct Args {
     /// Bandwidth of the filter between prediction and arm, rad/s: less is smoother, and farther behind [default: 45].
     #[arg(long, value_name = "RAD_S")]
     pub bandwidth: Option<f64>,
+    /// Speak protocol versions up to this one; 2 is an experiment [default: 1].
+    #[arg(long, value_name = "N")]
+    pub protocol_max: Option<u16>,
     /// Write every tick to this CSV file.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
@@ -87,6 +90,7 @@ struct File {
     start: Option<Vec<f64>>,
     dead_time_s: Option<f64>,
     bandwidth_rad_s: Option<f64>,
+    protocol_max: Option<u16>,
     record: Option<PathBuf>,
 }
 
@@ -116,6 +120,7 @@ pub enum Event {
     },
     Connected {
         epoch: u32,
+        version: u16,
         peer: SocketAddr,
     },
     Disconnected {
@@ -260,7 +265,10 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         endpoint,
         HostClock::new(),
         rig.info(),
-        SessionConfig::default(),
+        SessionConfig {
+            versions: cli::versions(args.protocol_max.or(file.protocol_max))?,
+            ..SessionConfig::default()
+        },
         handle,
         Some(running.timing.clone()),
     );
@@ -352,10 +360,17 @@ async fn listen_to(
                     });
                 }
             }
-            Notice::Connected { epoch, peer } => {
-                log.say(&Event::Connected { epoch, peer }, || {
-                    format!("operator {peer} (session {epoch})")
-                });
+            Notice::Connected {
+                epoch,
+                version,
+                peer,
+            } => {
+                let connected = Event::Connected {
+                    epoch,
+                    version: version.number(),
+                    peer,
+                };
+                log.say(&connected, || format!("operator {peer} (session {epoch})"));
             }
             Notice::Disconnected {
                 why,

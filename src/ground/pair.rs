@@ -20,6 +20,7 @@ use telemime_protocol::time::Stamp;
 use telemime_robot::daemon::{Daemon as RobotDaemon, Notice as RobotNotice};
 use telemime_robot::rig::Rig;
 use telemime_robot::servo::{self, Report};
+use telemime_robot::session::SessionConfig as RobotConfig;
 use telemime_sim::link::LinkConfig;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval};
@@ -137,6 +138,14 @@ impl Pair {
     /// # Errors
     /// [`PairError`].
     pub fn start(rig: &Rig) -> Result<Self, PairError> {
+        Self::start_with(rig, Default::default())
+    }
+
+    /// As [`Pair::start`], with the sessions set to `config`.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn start_with(rig: &Rig, config: RobotConfig) -> Result<Self, PairError> {
         let network = Network::new();
         let clock = HostClock::from_zero();
         let robot_identity = Identity::ephemeral()?;
@@ -162,14 +171,7 @@ impl Pair {
             socket,
             &Meter::default(),
         )?;
-        let daemon = RobotDaemon::new(
-            endpoint,
-            clock,
-            rig.info(),
-            Default::default(),
-            handle,
-            None,
-        );
+        let daemon = RobotDaemon::new(endpoint, clock, rig.info(), config, handle, None);
         let (quit, quit_rx) = watch::channel(false);
         let (tx, mut rx) = mpsc::unbounded_channel();
         let (words, words_rx) = mpsc::unbounded_channel();

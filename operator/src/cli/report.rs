@@ -162,6 +162,7 @@ pub enum Event {
     },
     Connected {
         epoch: u32,
+        version: u16,
     },
     Lost {
         why: String,
@@ -310,7 +311,7 @@ impl Event {
                 ))
             ),
             Self::Dialling { why } => format!("dialling: {why}"),
-            Self::Connected { epoch } => format!("connected (session {epoch})"),
+            Self::Connected { epoch, .. } => format!("connected (session {epoch})"),
             Self::Lost { why } => format!("link lost: {why}"),
             Self::Mapping {
                 robot,
@@ -471,7 +472,10 @@ pub(super) async fn listen_to(
         }
         let event = match notice {
             Notice::Dialling { why } => Event::Dialling { why },
-            Notice::Connected { epoch } => Event::Connected { epoch },
+            Notice::Connected { epoch, version } => Event::Connected {
+                epoch,
+                version: version.number(),
+            },
             Notice::Lost { why } => Event::Lost { why },
             Notice::Mapping {
                 scale,

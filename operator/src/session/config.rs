@@ -3,6 +3,7 @@
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_protocol::skill::Stats;
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::Versions;
 use telemime_protocol::wire::v1::Info;
 
 /// How far the robot's prediction may be off before the operator speaks.
@@ -37,6 +38,8 @@ pub struct SessionConfig {
     pub scale: Option<f64>,
     /// Hand axes to the robot's base axes.
     pub rotation: UnitQuaternion<f64>,
+    /// The protocol versions this operator offers.
+    pub versions: Versions,
 }
 
 impl Default for SessionConfig {
@@ -52,6 +55,7 @@ impl Default for SessionConfig {
             gain: 1.0,
             scale: None,
             rotation: UnitQuaternion::identity(),
+            versions: Versions::default(),
         }
     }
 }

@@ -20,6 +20,7 @@ use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::predict::Params;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::Version;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::v1::{
     Drive, Engage, Info, Message, OperatorControl, OperatorDatagram, PathTail, Refusal, RobotState,
@@ -53,6 +54,7 @@ enum Activity {
 /// One session with a robot.
 pub struct Session {
     config: SessionConfig,
+    version: Version,
     epoch: u32,
     skill: Option<Arc<Skill>>,
     info: Option<Info>,
@@ -89,6 +91,7 @@ impl Session {
     pub fn new(config: SessionConfig, skill: Option<Arc<Skill>>, epoch: u32) -> Self {
         Self {
             config,
+            version: Version::V1,
             epoch,
             skill,
             info: None,
@@ -115,6 +118,13 @@ impl Session {
             outputs: VecDeque::new(),
             events: VecDeque::new(),
         }
+    }
+
+    /// Speaks `version` instead of version 1.
+    #[must_use]
+    pub fn speaking(mut self, version: Version) -> Self {
+        self.version = version;
+        self
     }
 
     /// Reports with [`Event::Recognised`] which of these skills the hand performs, whenever that changes. It
@@ -461,7 +471,7 @@ impl Session {
         };
         self.counters.messages += 1;
         self.outputs.push_back(Output::Datagram {
-            bytes: datagram.encode(),
+            bytes: self.version.encode_operator_datagram(&datagram),
             motion: true,
         });
     }
@@ -507,7 +517,7 @@ impl Session {
 
     fn datagram(&mut self, message: &OperatorDatagram) {
         self.outputs.push_back(Output::Datagram {
-            bytes: message.encode(),
+            bytes: self.version.encode_operator_datagram(message),
             motion: false,
         });
     }

@@ -8,6 +8,7 @@ use std::thread;
 use std::time::Duration;
 
 use serde::Serialize;
+use telemime_protocol::wire::{Version, Versions};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{mpsc, watch};
 
@@ -38,6 +39,27 @@ pub fn resolve(text: &str) -> Result<SocketAddr, String> {
     first
         .copied()
         .ok_or_else(|| format!("`{text}` has no address"))
+}
+
+/// `--protocol-max` names a version this build does not know.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("--protocol-max {number}: this build knows protocol version 1, and 2 as an experiment")]
+pub struct UnknownVersion {
+    /// The number given.
+    pub number: u16,
+}
+
+/// The protocol versions of `--protocol-max`: from 1 to it, and 1 alone without it.
+///
+/// # Errors
+/// [`UnknownVersion`].
+pub fn versions(highest: Option<u16>) -> Result<Versions, UnknownVersion> {
+    let Some(number) = highest else {
+        return Ok(Versions::default());
+    };
+    Version::from_number(number)
+        .and_then(|highest| Versions::new(Version::V1, highest))
+        .ok_or(UnknownVersion { number })
 }
 
 /// An error and its causes in one line, each said once: a cause that the text before it quotes is left out.

@@ -15,7 +15,6 @@ use telemime_endpoint::Mono;
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
-use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::turn::{WireRotation, dequantise_grip, quantise_grip};
@@ -23,6 +22,7 @@ use telemime_protocol::wire::v1::{
     Cause, Drive, Engage, Info, MAX_PLAN_LEN, Message, ModelId, OperatorControl, OperatorDatagram,
     Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
 };
+use telemime_protocol::wire::{DecodeError, Version, Versions};
 
 use crate::clock::{SessionClock, Slew};
 use crate::servo::{Engagement, Lease, Order, Report, Source, Ticket, Trajectory};
@@ -40,6 +40,8 @@ pub struct SessionConfig {
     pub telemetry_s: f64,
     /// A sample that took longer than this to arrive authorises nothing beyond, s.
     pub max_delay_s: f64,
+    /// The protocol versions this robot speaks.
+    pub versions: Versions,
 }
 
 impl Default for SessionConfig {
@@ -47,6 +49,7 @@ impl Default for SessionConfig {
         Self {
             telemetry_s: 0.05,
             max_delay_s: 0.5,
+            versions: Versions::default(),
         }
     }
 }
@@ -96,6 +99,7 @@ pub struct Session {
     config: SessionConfig,
     info: Info,
     epoch: u32,
+    version: Version,
     clock: SessionClock,
     skill: Option<Arc<Skill>>,
     /// Takes its place at the next engage.
@@ -130,6 +134,7 @@ impl Session {
         let mut session = Self {
             config,
             epoch,
+            version: Version::V1,
             clock: SessionClock::default(),
             skill,
             next_skill: None,
@@ -153,6 +158,13 @@ impl Session {
         session.send(&RobotControl::Info(session.info.clone()));
         session.order(Order::Operator(true));
         session
+    }
+
+    /// Speaks `version` instead of version 1.
+    #[must_use]
+    pub fn speaking(mut self, version: Version) -> Self {
+        self.version = version;
+        self
     }
 
     /// The model held, for the next session.
@@ -222,7 +234,7 @@ impl Session {
 
     /// A datagram. Nothing in it can end the session: what is wrong is dropped and counted.
     pub fn handle_datagram(&mut self, now: Mono, bytes: &[u8]) {
-        let taken = match OperatorDatagram::decode(bytes) {
+        let taken = match self.version.decode_operator_datagram(bytes) {
             Ok(OperatorDatagram::Motion(motion)) => self.on_motion(now, &motion),
             Ok(OperatorDatagram::Go {
                 epoch,
