@@ -1,0 +1,320 @@
+//! Who is learned from and who is predicted, round by round.
+
+use std::sync::Arc;
+
+use clap::ValueEnum;
+use rayon::prelude::*;
+use telemime_operator::demonstration::{Demonstration, Demonstrations, PersonPattern};
+use telemime_operator::learn::{LearnError, LearnOptions, learn_skill};
+use telemime_protocol::skill::{MAX_SOURCES, Skill};
+use telemime_sim::link::LinkConfig;
+
+use super::dual::{self, Outcome, Scheme};
+use super::experts::{Side, experts};
+use super::kalman::Kalman;
+use super::score::{Tally, perform, tally};
+
+/// What is held out of learning.
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Protocol {
+    /// One performance; learned from are others of the same person.
+    SamePerson,
+    /// One performance; learned from are all others, whoever performs.
+    LeaveOneOut,
+    /// All that a person does; learned from are the others.
+    Cross,
+}
+
+impl Protocol {
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::SamePerson => "same-person",
+            Self::LeaveOneOut => "leave-one-out",
+            Self::Cross => "cross",
+        }
+    }
+
+    /// Demonstrations learned from unless told otherwise: what an operator may be asked for, or all.
+    pub(super) fn usual(self) -> usize {
+        match self {
+            Self::SamePerson => 3,
+            Self::LeaveOneOut | Self::Cross => MAX_SOURCES,
+        }
+    }
+}
+
+/// Why recordings cannot be evaluated.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum EvaluateError {
+    #[error(
+        "{0}: nothing can be held out: one recording. Record the skill again: two are enough to try, three or more to trust"
+    )]
+    One(String),
+    #[error(
+        "{name}: {found} recordings, but nobody performed twice, as {pattern} finds persons in the file names: \
+         try --protocol leave-one-out, or say with --group-by where the names hold the person"
+    )]
+    Once {
+        name: String,
+        found: usize,
+        pattern: String,
+    },
+    #[error(
+        "{name}: all recordings are by one person ({person:?}), as {pattern} finds persons in the file names: \
+         use --protocol same-person, or say with --group-by where the names hold the person"
+    )]
+    OnePerson {
+        name: String,
+        person: String,
+        pattern: String,
+    },
+    #[error("{name}, learned for {held}: {source}")]
+    Learn {
+        name: String,
+        held: String,
+        source: LearnError,
+    },
+}
+
+/// One skill to learn and what it then predicts.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Round {
+    /// The folder.
+    pub(super) set: usize,
+    /// Of it: what is learned from, never empty.
+    learn: Vec<usize>,
+    /// Of it: what is predicted.
+    test: Vec<usize>,
+    /// (off-model folder, recording): what else is predicted.
+    off: Vec<(usize, usize)>,
+}
+
+/// Everything there is to try.
+pub(super) struct Plan<'a> {
+    pub(super) sets: &'a [Demonstrations],
+    pub(super) off_model: &'a [Demonstrations],
+    pub(super) protocol: Protocol,
+    pub(super) persons: &'a PersonPattern,
+    /// Most demonstrations a skill is learned from.
+    pub(super) most: usize,
+    pub(super) horizons_s: &'a [f64],
+    pub(super) schemes: &'a [Scheme],
+    pub(super) link: &'a LinkConfig,
+    pub(super) seed: u64,
+}
+
+/// One recording, predicted by a skill that was learned without it.
+pub(super) struct Performance {
+    /// The folder learned from.
+    pub(super) set: usize,
+    /// The off-model folder performed, if it is not the same.
+    pub(super) off: Option<usize>,
+    pub(super) name: String,
+    /// [expert][horizon].
+    pub(super) places: Vec<Vec<Tally>>,
+    /// The same of orientations, where there are any.
+    pub(super) turns: Option<Vec<Vec<Tally>>>,
+    /// Of the mixture, moment by moment, in multiples of the calibrated 90 % quantile.
+    pub(super) novelty: Vec<f64>,
+    /// One a scheme; none off the model.
+    pub(super) dual: Vec<Outcome>,
+}
+
+impl Plan<'_> {
+    /// The rounds on the model, then those off it.
+    pub(super) fn rounds(&self) -> Result<Vec<Round>, EvaluateError> {
+        let mut all = Vec::new();
+        for (set, recordings) in self.sets.iter().enumerate() {
+            let here = self.rounds_of(set);
+            if here.is_empty() {
+                let name = recordings.name.clone();
+                let found = recordings.demonstrations.len();
+                let pattern = self.persons.to_string();
+                return Err(match self.protocol {
+                    _ if found == 1 => EvaluateError::One(name),
+                    Protocol::Cross => EvaluateError::OnePerson {
+                        person: self
+                            .persons
+                            .person(&recordings.demonstrations[0])
+                            .to_owned(),
+                        name,
+                        pattern,
+                    },
+                    _ => EvaluateError::Once {
+                        name,
+                        found,
+                        pattern,
+                    },
+                });
+            }
+            all.extend(here);
+        }
+        for set in 0..self.sets.len() {
+            all.extend(self.off_rounds(set));
+        }
+        Ok(all)
+    }
+
+    /// (person, recordings), in order of first appearance.
+    fn groups(&self, set: usize) -> Vec<(&str, Vec<usize>)> {
+        let mut groups: Vec<(&str, Vec<usize>)> = Vec::new();
+        for (n, d) in self.sets[set].demonstrations.iter().enumerate() {
+            let who = self.persons.person(d);
+            match groups.iter_mut().find(|(w, _)| *w == who) {
+                Some((_, of)) => of.push(n),
+                None => groups.push((who, vec![n])),
+            }
+        }
+        groups
+    }
+
+    fn rounds_of(&self, set: usize) -> Vec<Round> {
+        let all: Vec<usize> = (0..self.sets[set].demonstrations.len()).collect();
+        let round = |test: Vec<usize>, from: &[usize]| {
+            let others = from.iter().filter(|n| !test.contains(n));
+            let learn: Vec<usize> = others.take(self.most).copied().collect();
+            (!learn.is_empty()).then_some(Round {
+                set,
+                learn,
+                test,
+                off: Vec::new(),
+            })
+        };
+        let groups = self.groups(set);
+        let rounds: Vec<_> = match self.protocol {
+            Protocol::SamePerson => groups
+                .iter()
+                .flat_map(|(_, of)| of.iter().map(|n| round(vec![*n], of)))
+                .collect(),
+            Protocol::LeaveOneOut => all.iter().map(|n| round(vec![*n], &all)).collect(),
+            Protocol::Cross => groups.into_iter().map(|(_, of)| round(of, &all)).collect(),
+        };
+        rounds.into_iter().flatten().collect()
+    }
+
+    /// A skill of each person (of all together, unless persons are told apart) before what it has never seen:
+    /// that person's off-model recordings, or everybody's if there are none.
+    fn off_rounds(&self, set: usize) -> Vec<Round> {
+        let groups = match self.protocol {
+            Protocol::SamePerson => self.groups(set),
+            Protocol::LeaveOneOut | Protocol::Cross => {
+                vec![("", (0..self.sets[set].demonstrations.len()).collect())]
+            }
+        };
+        let known: Vec<_> = self.sets[set]
+            .demonstrations
+            .iter()
+            .map(|d| d.sha256())
+            .collect();
+        let strange: Vec<(usize, usize)> = (0..self.off_model.len())
+            .flat_map(|dir| (0..self.off_model[dir].demonstrations.len()).map(move |n| (dir, n)))
+            // A folder may be given as both, so that each of several is off the others' model.
+            .filter(|(dir, n)| !known.contains(&self.off_model[*dir].demonstrations[*n].sha256()))
+            .collect();
+        let round = |(who, of): (&str, Vec<usize>)| {
+            let by = |at: &&(usize, usize)| {
+                self.persons
+                    .person(&self.off_model[at.0].demonstrations[at.1])
+                    == who
+            };
+            let own: Vec<_> = strange.iter().filter(by).copied().collect();
+            Round {
+                set,
+                learn: of.into_iter().take(self.most).collect(),
+                test: Vec::new(),
+                off: if own.is_empty() { strange.clone() } else { own },
+            }
+        };
+        let rounds = groups.into_iter().map(round);
+        rounds.filter(|round| !round.off.is_empty()).collect()
+    }
+
+    /// Runs the rounds on all cores; the result does not depend on how many there are. `progress` hears of every
+    /// round done, from any thread.
+    pub(super) fn run(
+        &self,
+        rounds: &[Round],
+        progress: impl Fn() + Sync,
+    ) -> Result<Vec<Performance>, EvaluateError> {
+        let done = rounds
+            .par_iter()
+            .map(|round| {
+                let performances = self.play(round);
+                progress();
+                performances
+            })
+            .collect::<Result<Vec<_>, _>>()?;
+        Ok(done.into_iter().flatten().collect())
+    }
+
+    fn play(&self, round: &Round) -> Result<Vec<Performance>, EvaluateError> {
+        let set = &self.sets[round.set];
+        let some: Vec<_> = round
+            .learn
+            .iter()
+            .map(|&n| set.demonstrations[n].clone())
+            .collect();
+        let options = LearnOptions {
+            seed: self.seed,
+            ..LearnOptions::default()
+        };
+        let tests = round.test.iter().map(|&n| (None, &set.demonstrations[n]));
+        let off = round
+            .off
+            .iter()
+            .map(|&(dir, n)| (Some(dir), &self.off_model[dir].demonstrations[n]));
+        let tests: Vec<_> = tests.chain(off).collect();
+        let learned = learn_skill(&set.name, &some, &options, |_| ());
+        let skill = Arc::new(learned.map_err(|source| EvaluateError::Learn {
+            name: set.name.clone(),
+            held: tests[0].1.name().to_owned(),
+            source,
+        })?);
+        let kalman = Kalman::tuned(&some);
+        Ok(tests
+            .into_iter()
+            .map(|(off, d)| self.predict(round.set, off, d, &skill, &kalman))
+            .collect())
+    }
+
+    fn predict(
+        &self,
+        set: usize,
+        off: Option<usize>,
+        d: &Demonstration,
+        skill: &Arc<Skill>,
+        kalman: &Kalman,
+    ) -> Performance {
+        let mut novelty = Vec::new();
+        let mut of = |side: Side| -> Vec<Vec<Tally>> {
+            let mut experts = experts(side, skill, kalman, self.horizons_s);
+            let courses = perform(side, d, &mut experts, self.horizons_s, |expert| {
+                if side == Side::Place {
+                    novelty.extend(expert.novelty());
+                }
+            });
+            let tallies = courses.iter().map(|courses| {
+                let each = courses.iter().zip(self.horizons_s);
+                each.map(|(course, h_s)| tally(side, d, course, *h_s))
+                    .collect()
+            });
+            tallies.collect()
+        };
+        let turned = d.has_orientation() && skill.turn().is_some();
+        let schemes = if off.is_none() { self.schemes } else { &[] };
+        // The head of a hash: chances of their own for every recording.
+        let seed = self.seed ^ u64::from_le_bytes(*d.sha256().first_chunk().expect("32 bytes"));
+        Performance {
+            set,
+            off,
+            name: d.name().to_owned(),
+            places: of(Side::Place),
+            turns: turned.then(|| of(Side::Turn)),
+            novelty,
+            dual: schemes
+                .iter()
+                .map(|scheme| dual::run(*scheme, d, skill, self.link, seed))
+                .collect(),
+        }
+    }
+}
