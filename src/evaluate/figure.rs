@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::dual::Scheme;
 use super::experts::GUARDED;
-use super::report::{Report, Section};
+use super::report::{Report, Section, nearest};
 use crate::figure::{
     BLACK, BLUE, Figure, FigureError, GREEN, GREY, Layer, ORANGE, Panel, SILVER, SKY, Shape,
     VERMILLION,
@@ -40,7 +40,7 @@ pub(super) fn write(report: &Report, path: &Path) -> Result<(), FigureError> {
     .write(path)
 }
 
-fn colour(name: &str) -> RGBColor {
+pub(super) fn colour(name: &str) -> RGBColor {
     match name {
         "hold" => BLACK,
         "constant velocity" => ORANGE,
@@ -171,13 +171,10 @@ fn performances(report: &Report) -> Panel {
             .map(|(n, r)| (100.0 * n as f64 / last, *r));
         layers.push(Layer::new(label, colour, Shape::Line(points.collect())));
     };
-    let nearest = |ms: f64| {
-        let off = |h: &f64| (h - ms).abs();
-        let all = report.horizons_ms.iter().enumerate();
-        all.min_by(|a, b| off(a.1).total_cmp(&off(b.1)))
-            .map_or(0, |(n, _)| n)
-    };
-    let (near, far) = (nearest(100.0), report.horizons_ms.len() - 1);
+    let (near, far) = (
+        nearest(&report.horizons_ms, 100.0),
+        report.horizons_ms.len() - 1,
+    );
     rank(
         format!("{} ms", report.horizons_ms[near]),
         SKY,

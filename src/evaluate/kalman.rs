@@ -6,7 +6,7 @@ use telemime_operator::demonstration::{Demonstration, Sample};
 use super::experts::{Expert, Guess};
 
 /// Ratios of jerk density (m²/s⁵) to measurement variance (m²) that are tried, as powers of ten.
-const RATIOS: std::ops::RangeInclusive<i32> = 2..=13;
+const RATIOS: std::ops::RangeInclusive<i32> = 2..=12;
 
 /// The horizon at which the ratio is chosen, s.
 const CHOSEN_AT_S: f64 = 0.1;

@@ -2,6 +2,8 @@
 
 mod dual;
 mod experts;
+mod failures;
+mod faults;
 mod figure;
 mod kalman;
 mod live;
@@ -65,6 +67,9 @@ pub(crate) struct Args {
     /// Draw what was found (.svg or .png).
     #[arg(long, value_name = "FILE")]
     figure: Option<PathBuf>,
+    /// Draw where it fails: one performance, the first moments, a change of mind, size and path.
+    #[arg(long, value_name = "FILE")]
+    failures: Option<PathBuf>,
     /// Seed of every random choice in learning.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -87,7 +92,7 @@ fn horizon_ms(text: &str) -> Result<f64, String> {
 
 /// Runs `telemime evaluate`.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    if let Some(path) = &args.figure {
+    for path in args.figure.iter().chain(&args.failures) {
         crate::figure::check(path)?;
     }
     let mut horizons_s: Vec<f64> = args.horizons.iter().map(|ms| ms * 1e-3).collect();
@@ -121,7 +126,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     bar.tick();
     let performances = plan.run(&rounds, || bar.inc(1));
     bar.finish_and_clear();
-    let report = report::report(&plan, &rounds, &performances?);
+    let performances = performances?;
+    let report = report::report(&plan, &rounds, &performances);
     let text = table::text(&report);
     if args.json {
         eprint!("{text}");
@@ -131,6 +137,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     }
     if let Some(path) = &args.figure {
         figure::write(&report, path).context("no figure")?;
+        eprintln!("wrote {}", path.display());
+    }
+    if let Some(path) = &args.failures {
+        failures::write(&report, &performances, path).context("no figure of failures")?;
         eprintln!("wrote {}", path.display());
     }
     Ok(())

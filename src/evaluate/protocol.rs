@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use clap::ValueEnum;
+use nalgebra::Vector3;
 use rayon::prelude::*;
 use telemime_operator::demonstration::{Demonstration, Demonstrations, PersonPattern};
 use telemime_operator::learn::{LearnError, LearnOptions, learn_skill};
@@ -11,8 +12,13 @@ use telemime_sim::link::LinkConfig;
 
 use super::dual::{self, Outcome, Scheme};
 use super::experts::{Side, experts};
+use super::faults::{self, Bin, Faults, Shape};
 use super::kalman::Kalman;
-use super::score::{Tally, perform, tally};
+use super::report::nearest;
+use super::score::{Course, Tally, perform, tally};
+
+/// Where a change of mind is looked at, s ahead.
+pub(super) const MIND_AT_S: f64 = 0.1;
 
 /// What is held out of learning.
 #[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
@@ -103,6 +109,16 @@ pub(super) struct Plan<'a> {
     pub(super) seed: u64,
 }
 
+/// One moment of the guarded predictor, at the horizon nearest to 100 ms.
+pub(super) struct Seen {
+    /// When what was predicted came, s.
+    pub(super) t_s: f64,
+    /// Predicted from here.
+    pub(super) from: Vector3<f64>,
+    pub(super) predicted: Vector3<f64>,
+    pub(super) truth: Vector3<f64>,
+}
+
 /// One recording, predicted by a skill that was learned without it.
 pub(super) struct Performance {
     /// The folder learned from.
@@ -116,6 +132,12 @@ pub(super) struct Performance {
     pub(super) turns: Option<Vec<Vec<Tally>>>,
     /// Of the mixture, moment by moment, in multiples of the calibrated 90 % quantile.
     pub(super) novelty: Vec<f64>,
+    /// None off the model.
+    pub(super) seen: Vec<Seen>,
+    /// Of positions, [expert][horizon]; none off the model.
+    pub(super) faults: Vec<Vec<Faults>>,
+    /// Of each expert, around a change of mind; none off the model, or where the recording is too short for one.
+    pub(super) mind: Vec<Vec<Bin>>,
     /// One a scheme; none off the model.
     pub(super) dual: Vec<Outcome>,
 }
@@ -286,21 +308,33 @@ impl Plan<'_> {
         kalman: &Kalman,
     ) -> Performance {
         let mut novelty = Vec::new();
-        let mut of = |side: Side| -> Vec<Vec<Tally>> {
+        let mut perform = |side: Side| {
             let mut experts = experts(side, skill, kalman, self.horizons_s);
-            let courses = perform(side, d, &mut experts, self.horizons_s, |expert| {
+            perform(side, d, &mut experts, self.horizons_s, |expert| {
                 if side == Side::Place {
                     novelty.extend(expert.novelty());
                 }
-            });
-            let tallies = courses.iter().map(|courses| {
-                let each = courses.iter().zip(self.horizons_s);
-                each.map(|(course, h_s)| tally(side, d, course, *h_s))
-                    .collect()
-            });
-            tallies.collect()
+            })
         };
+        let places = perform(Side::Place);
         let turned = d.has_orientation() && skill.turn().is_some();
+        let turns = turned.then(|| perform(Side::Turn));
+        let faults = if off.is_none() {
+            let shape = Shape::of(d);
+            self.each(&places, |course, h_s| {
+                faults::faults(d, &shape, course, h_s)
+            })
+        } else {
+            Vec::new()
+        };
+        let changed = faults::change_of_mind(d).filter(|_| off.is_none());
+        let mind = changed.map(|(changed, turn_s)| {
+            let mut experts = experts(Side::Place, skill, kalman, &[MIND_AT_S]);
+            faults::around(&changed, turn_s, &mut experts, MIND_AT_S)
+        });
+        let tallies = |side, courses: &[Vec<Course>]| {
+            self.each(courses, |course, h_s| tally(side, d, course, h_s))
+        };
         let schemes = if off.is_none() { self.schemes } else { &[] };
         // The head of a hash: chances of their own for every recording.
         let seed = self.seed ^ u64::from_le_bytes(*d.sha256().first_chunk().expect("32 bytes"));
@@ -308,13 +342,44 @@ impl Plan<'_> {
             set,
             off,
             name: d.name().to_owned(),
-            places: of(Side::Place),
-            turns: turned.then(|| of(Side::Turn)),
+            places: tallies(Side::Place, &places),
+            turns: turns.map(|turns| tallies(Side::Turn, &turns)),
             novelty,
+            seen: if off.is_none() {
+                self.seen(d, &places)
+            } else {
+                Vec::new()
+            },
+            faults,
+            mind: mind.unwrap_or_default(),
             dual: schemes
                 .iter()
                 .map(|scheme| dual::run(*scheme, d, skill, self.link, seed))
                 .collect(),
         }
+    }
+
+    fn seen(&self, d: &Demonstration, places: &[Vec<Course>]) -> Vec<Seen> {
+        let near = nearest(self.horizons_s, MIND_AT_S);
+        let course = places.last().map_or(&[][..], |courses| &courses[near]);
+        let seen = course.iter().map(|m| {
+            let now = &d.samples()[m.sample];
+            Seen {
+                t_s: now.t_s + self.horizons_s[near],
+                from: now.position,
+                predicted: now.position + m.guess.way,
+                truth: now.position + m.truth,
+            }
+        });
+        seen.collect()
+    }
+
+    /// Of every [expert][horizon].
+    fn each<T>(&self, courses: &[Vec<Course>], of: impl Fn(&Course, f64) -> T) -> Vec<Vec<T>> {
+        let row = |courses: &Vec<Course>| {
+            let each = courses.iter().zip(self.horizons_s);
+            each.map(|(course, h_s)| of(course, *h_s)).collect()
+        };
+        courses.iter().map(row).collect()
     }
 }

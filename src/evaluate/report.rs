@@ -4,7 +4,8 @@ use serde::Serialize;
 
 use super::dual::{Outcome, Scheme};
 use super::experts::{GUARDED, PLACE_NAMES, Side, TURN_NAMES};
-use super::protocol::{Performance, Plan, Round};
+use super::faults::{Bin, Faults, MIND_AFTER, MIND_BEFORE, MIND_STEP_S, SINCE_S};
+use super::protocol::{MIND_AT_S, Performance, Plan, Round};
 use super::score::Tally;
 
 /// A performance worse than holding by this factor is named.
@@ -31,6 +32,7 @@ pub(super) struct Report {
     pub(super) off_model: Option<Section>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) off_model_orientation: Option<Section>,
+    pub(super) faults: Faulty,
     pub(super) dual: Dual,
 }
 
@@ -93,6 +95,50 @@ pub(super) struct Above {
     pub(super) ratio: f64,
 }
 
+/// Where predictions of positions fail.
+#[derive(Debug, Serialize)]
+pub(super) struct Faulty {
+    /// Ends of the times since the onset, ms: before the first the hand rests, after the last but one there is no end.
+    pub(super) since_onset_ms: Vec<Option<f64>>,
+    pub(super) experts: Vec<FaultyRow>,
+    /// How far ahead changes of mind are looked at, ms.
+    pub(super) mind_at_ms: f64,
+    /// Performances turned back at their fastest moment.
+    pub(super) minds_changed: usize,
+    /// Times after the turn, ms.
+    pub(super) mind_ms: Vec<f64>,
+    /// RMSE of each expert at these times, mm.
+    pub(super) mind_mm: Vec<Vec<Option<f64>>>,
+}
+
+/// One predictor.
+#[derive(Debug, Serialize)]
+pub(super) struct FaultyRow {
+    pub(super) name: &'static str,
+    pub(super) horizons: Vec<FaultyCell>,
+}
+
+/// One predictor at one horizon.
+#[derive(Debug, Serialize)]
+pub(super) struct FaultyCell {
+    /// RMSE by time since the onset, mm.
+    pub(super) since_onset_mm: Vec<Option<f64>>,
+    /// Shares of the squared error that fall into these times.
+    pub(super) since_onset_share: Vec<Option<f64>>,
+    /// RMSE over that of holding where the hand is to turn back.
+    pub(super) turning_back: Option<f64>,
+    /// Distance from the hand's path: root mean square, mm.
+    pub(super) off_path_mm: Option<f64>,
+    /// Its 95 % quantile.
+    pub(super) off_path_95_mm: Option<f64>,
+    /// How large predicted motion is, 1 as large as the hand's.
+    pub(super) amplitude: Option<f64>,
+    /// Mean of how far it goes beyond the hand where that turns, as a share of the hand's range.
+    pub(super) overshoot: Option<f64>,
+    /// Its 95 % quantile.
+    pub(super) overshoot_95: Option<f64>,
+}
+
 /// Messages against error.
 #[derive(Debug, Serialize)]
 pub(super) struct Dual {
@@ -142,6 +188,7 @@ pub(super) fn report(plan: &Plan<'_>, rounds: &[Round], performances: &[Performa
         orientation: section(Side::Turn, false),
         off_model: section(Side::Place, true),
         off_model_orientation: section(Side::Turn, true),
+        faults: faulty(plan, performances),
         dual: dual(plan, performances),
     }
 }
@@ -224,14 +271,14 @@ fn section(
             .collect(),
         Side::Turn => Vec::new(),
     };
-    novelty.sort_by(f64::total_cmp);
-    let quantile = |q: f64| novelty[((novelty.len() - 1) as f64 * q).round() as usize];
     Some(Section {
         unit,
         performances: ones,
         experts,
         above,
-        novelty: (!novelty.is_empty()).then(|| [quantile(0.5), quantile(0.9)]),
+        novelty: quantile(&mut novelty, 0.5)
+            .zip(quantile(&mut novelty, 0.9))
+            .map(Into::into),
         groups,
     })
 }
@@ -259,6 +306,86 @@ fn cell<'a>(groups: usize, tallies: impl Iterator<Item = (usize, &'a Tally)>, sc
         coverage: all.coverage(),
         worst,
     }
+}
+
+fn faulty(plan: &Plan<'_>, performances: &[Performance]) -> Faulty {
+    let on = || performances.iter().filter(|p| p.off.is_none());
+    let cell = |expert: usize, h: usize| {
+        let mut sum = Faults::default();
+        on().for_each(|p| sum.add(&p.faults[expert][h]));
+        let all_2: f64 = sum.since_onset.iter().map(|b| b.error_2).sum();
+        let square = sum.off_path_m.iter().map(|m| m * m).sum::<f64>();
+        let mean = |values: &[f64]| finite(values.iter().sum::<f64>() / values.len() as f64);
+        FaultyCell {
+            since_onset_mm: sum
+                .since_onset
+                .iter()
+                .map(|b| b.rmse_m().map(|m| m * 1e3))
+                .collect(),
+            since_onset_share: sum
+                .since_onset
+                .iter()
+                .map(|b| finite(b.error_2 / all_2))
+                .collect(),
+            turning_back: sum
+                .against
+                .rmse_m()
+                .zip(sum.against.hold_m())
+                .and_then(|(m, hold_m)| finite(m / hold_m)),
+            off_path_mm: finite((square / sum.off_path_m.len() as f64).sqrt() * 1e3),
+            amplitude: sum.amplitude(),
+            overshoot: mean(&sum.overshoot),
+            overshoot_95: quantile(&mut sum.overshoot, 0.95),
+            off_path_95_mm: quantile(&mut sum.off_path_m, 0.95).map(|m| m * 1e3),
+        }
+    };
+    let steps = -MIND_BEFORE..=MIND_AFTER;
+    let mind = |expert: usize| {
+        let at = |n: usize| {
+            let mut bin = Bin::default();
+            on().filter_map(|p| p.mind.get(expert))
+                .for_each(|bins| bin.add(&bins[n]));
+            bin.rmse_m().map(|m| m * 1e3)
+        };
+        (0..steps.clone().count()).map(at).collect()
+    };
+    let experts = || 0..PLACE_NAMES.len();
+    Faulty {
+        since_onset_ms: SINCE_S.iter().map(|s| finite(ms(*s))).collect(),
+        experts: experts()
+            .map(|expert| FaultyRow {
+                name: PLACE_NAMES[expert],
+                horizons: (0..plan.horizons_s.len())
+                    .map(|h| cell(expert, h))
+                    .collect(),
+            })
+            .collect(),
+        mind_at_ms: ms(MIND_AT_S),
+        minds_changed: on().filter(|p| !p.mind.is_empty()).count(),
+        mind_ms: steps
+            .clone()
+            .map(|n| ms(f64::from(n) * MIND_STEP_S))
+            .collect(),
+        mind_mm: experts().map(mind).collect(),
+    }
+}
+
+/// The place of the value nearest to `wanted`.
+pub(super) fn nearest(values: &[f64], wanted: f64) -> usize {
+    let off = |v: &f64| (v - wanted).abs();
+    let all = values.iter().enumerate();
+    all.min_by(|a, b| off(a.1).total_cmp(&off(b.1)))
+        .map_or(0, |(n, _)| n)
+}
+
+fn finite(value: f64) -> Option<f64> {
+    Some(value).filter(|v| v.is_finite())
+}
+
+fn quantile(values: &mut [f64], q: f64) -> Option<f64> {
+    values.sort_by(f64::total_cmp);
+    let last = values.len().checked_sub(1)?;
+    Some(values[(last as f64 * q).round() as usize])
 }
 
 fn dual(plan: &Plan<'_>, performances: &[Performance]) -> Dual {

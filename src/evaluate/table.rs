@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::report::{Cell, DualRow, Report, Row, Section};
+use super::report::{Cell, DualRow, FaultyCell, Report, Row, Section};
 
 const NAME: usize = 22;
 
@@ -35,6 +35,7 @@ pub(super) fn text(report: &Report) -> String {
     if let Some(off) = &report.off_model_orientation {
         section(&mut out, report, "off the model, orientation", off);
     }
+    faults(&mut out, report);
     dual(&mut out, report);
     out
 }
@@ -44,11 +45,7 @@ fn number(value: Option<f64>, decimals: usize) -> String {
 }
 
 fn section(out: &mut String, report: &Report, title: &str, section: &Section) {
-    let heads: String = report
-        .horizons_ms
-        .iter()
-        .map(|h| format!("{:>8}", format!("{h} ms")))
-        .collect();
+    let heads = heads(report);
     let groups = section.groups.len();
     let of = if groups > 1 {
         format!(", geometric mean of {groups}")
@@ -124,6 +121,69 @@ fn section(out: &mut String, report: &Report, title: &str, section: &Section) {
             );
         }
     }
+}
+
+fn faults(out: &mut String, report: &Report) {
+    let faulty = &report.faults;
+    let Some(own) = faulty.experts.last() else {
+        return;
+    };
+    let _ = writeln!(out, "\n== where it fails: {} ==", own.name);
+    let _ = writeln!(out, "{:NAME$}{}", "", heads(report));
+    let mut row = |name: &str, of: &dyn Fn(&FaultyCell) -> String| {
+        let cells: String = own
+            .horizons
+            .iter()
+            .map(|c| format!("{:>8}", of(c)))
+            .collect();
+        let _ = writeln!(out, "{name:NAME$}{cells}");
+    };
+    let percent = |share: Option<f64>, decimals| number(share.map(|s| 100.0 * s), decimals);
+    for (n, end) in faulty.since_onset_ms.iter().enumerate() {
+        let name = match (n, end) {
+            (0, _) => "at rest".to_owned(),
+            (_, Some(end)) => format!("to {end} ms of motion"),
+            (_, None) => "later".to_owned(),
+        };
+        row(&format!("{name}, mm"), &|c| number(c.since_onset_mm[n], 1));
+    }
+    for (n, end) in faulty.since_onset_ms.iter().enumerate() {
+        let name = match (n, end) {
+            (0, _) => "share, at rest".to_owned(),
+            (_, Some(end)) => format!("  to {end} ms"),
+            (_, None) => "  later".to_owned(),
+        };
+        row(&format!("{name}, %"), &|c| {
+            percent(c.since_onset_share[n], 1)
+        });
+    }
+    row("turning back / hold", &|c| number(c.turning_back, 3));
+    row("off the path, mm", &|c| number(c.off_path_mm, 1));
+    row("  95 % below, mm", &|c| number(c.off_path_95_mm, 1));
+    row("amplitude", &|c| number(c.amplitude, 3));
+    row("beyond turns, %", &|c| percent(c.overshoot, 1));
+    row("  95 % below, %", &|c| percent(c.overshoot_95, 1));
+    let _ = writeln!(
+        out,
+        "{} performances turned back at their fastest moment, {} ms ahead: RMSE, mm",
+        faulty.minds_changed, faulty.mind_at_ms
+    );
+    let shown = || (0..faulty.mind_ms.len()).step_by(3);
+    let times: String = shown()
+        .map(|n| format!("{:>8.0}", faulty.mind_ms[n]))
+        .collect();
+    let _ = writeln!(out, "{:NAME$}{times} ms", "");
+    for (row, mm) in faulty.experts.iter().zip(&faulty.mind_mm) {
+        let cells: String = shown()
+            .map(|n| format!("{:>8}", number(mm[n], 0)))
+            .collect();
+        let _ = writeln!(out, "{:NAME$}{cells}", row.name);
+    }
+}
+
+fn heads(report: &Report) -> String {
+    let heads = report.horizons_ms.iter();
+    heads.map(|h| format!("{:>8}", format!("{h} ms"))).collect()
 }
 
 fn dual(out: &mut String, report: &Report) {
