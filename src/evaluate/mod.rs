@@ -1,5 +1,6 @@
 //! `telemime evaluate`: what prediction is worth on anyone's recordings.
 
+mod arm;
 mod dual;
 mod experts;
 mod failures;
@@ -16,11 +17,15 @@ use std::path::PathBuf;
 
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
+use telemime_operator::cli::Axes;
 use telemime_operator::demonstration::{Demonstration, Demonstrations, PersonPattern};
-use telemime_operator::session::FutureBound;
+use telemime_operator::session::{FutureBound, SessionConfig};
 use telemime_protocol::predict::{KNOT_SPACING_S, MAX_KNOTS};
 
+use telemime_robot::rig::{Rig, RigOptions};
+
 use crate::cli::Shape;
+use arm::Drive;
 use dual::Scheme;
 use protocol::{Plan, Protocol};
 
@@ -64,6 +69,15 @@ pub(crate) struct Args {
     matching: Option<String>,
     #[command(flatten)]
     link: Shape,
+    /// Drive the arm too: both daemons and real QUIC over that link, on a virtual clock.
+    #[arg(long)]
+    arm: bool,
+    /// The arm [default: a 7-axis arm of our own].
+    #[arg(long, value_name = "FILE", requires = "arm")]
+    urdf: Option<PathBuf>,
+    /// The recordings' axes, as the arm is to see them.
+    #[arg(long, value_enum, default_value_t = Axes::Kinect, requires = "arm")]
+    axes: Axes,
     /// Draw what was found (.svg or .png).
     #[arg(long, value_name = "FILE")]
     figure: Option<PathBuf>,
@@ -105,6 +119,21 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         bail!("--rate: the study's link has no bottleneck; telemime demo shows one");
     }
     let schemes = schemes(&sets, link.delay_s);
+    let arm = if args.arm {
+        Some(Drive {
+            rig: Rig::load(&RigOptions {
+                urdf: args.urdf.clone(),
+                ..RigOptions::default()
+            })?,
+            config: SessionConfig {
+                rotation: args.axes.rotation(),
+                ..SessionConfig::default()
+            },
+            link: link.clone(),
+        })
+    } else {
+        None
+    };
     let plan = Plan {
         sets: &sets,
         off_model: &off_model,
@@ -116,6 +145,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         horizons_s: &horizons_s,
         schemes: &schemes,
         link: &link,
+        arm: arm.as_ref(),
         seed: args.seed,
     };
     let rounds = plan.rounds()?;

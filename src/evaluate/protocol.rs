@@ -10,6 +10,7 @@ use telemime_operator::learn::{LearnError, LearnOptions, learn_skill};
 use telemime_protocol::skill::{MAX_SOURCES, Skill};
 use telemime_sim::link::LinkConfig;
 
+use super::arm::{self, ArmError, Drive, Driven};
 use super::dual::{self, Outcome, Scheme};
 use super::experts::{Side, experts};
 use super::faults::{self, Bin, Faults, Shape};
@@ -80,6 +81,8 @@ pub(super) enum EvaluateError {
         held: String,
         source: LearnError,
     },
+    #[error(transparent)]
+    Arm(#[from] ArmError),
 }
 
 /// One skill to learn and what it then predicts.
@@ -106,6 +109,8 @@ pub(super) struct Plan<'a> {
     pub(super) horizons_s: &'a [f64],
     pub(super) schemes: &'a [Scheme],
     pub(super) link: &'a LinkConfig,
+    /// The arm to drive, too.
+    pub(super) arm: Option<&'a Drive>,
     pub(super) seed: u64,
 }
 
@@ -140,6 +145,8 @@ pub(super) struct Performance {
     pub(super) mind: Vec<Vec<Bin>>,
     /// One a scheme; none off the model.
     pub(super) dual: Vec<Outcome>,
+    /// What the arm did; none off the model.
+    pub(super) driven: Option<Driven>,
 }
 
 impl Plan<'_> {
@@ -293,10 +300,10 @@ impl Plan<'_> {
             source,
         })?);
         let kalman = Kalman::tuned(&some);
-        Ok(tests
+        tests
             .into_iter()
             .map(|(off, d)| self.predict(round.set, off, d, &skill, &kalman))
-            .collect())
+            .collect()
     }
 
     fn predict(
@@ -306,7 +313,7 @@ impl Plan<'_> {
         d: &Demonstration,
         skill: &Arc<Skill>,
         kalman: &Kalman,
-    ) -> Performance {
+    ) -> Result<Performance, EvaluateError> {
         let mut novelty = Vec::new();
         let mut perform = |side: Side| {
             let mut experts = experts(side, skill, kalman, self.horizons_s);
@@ -338,7 +345,9 @@ impl Plan<'_> {
         let schemes = if off.is_none() { self.schemes } else { &[] };
         // The head of a hash: chances of their own for every recording.
         let seed = self.seed ^ u64::from_le_bytes(*d.sha256().first_chunk().expect("32 bytes"));
-        Performance {
+        let arm = self.arm.filter(|_| off.is_none());
+        let driven = arm.map(|arm| arm::drive(d, skill, arm, seed)).transpose()?;
+        Ok(Performance {
             set,
             off,
             name: d.name().to_owned(),
@@ -356,7 +365,8 @@ impl Plan<'_> {
                 .iter()
                 .map(|scheme| dual::run(*scheme, d, skill, self.link, seed))
                 .collect(),
-        }
+            driven,
+        })
     }
 
     fn seen(&self, d: &Demonstration, places: &[Vec<Course>]) -> Vec<Seen> {

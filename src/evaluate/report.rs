@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::arm::{Driven, WAYS};
 use super::dual::{Outcome, Scheme};
 use super::experts::{GUARDED, PLACE_NAMES, Side, TURN_NAMES};
 use super::faults::{Bin, Faults, MIND_AFTER, MIND_BEFORE, MIND_STEP_S, SINCE_S};
@@ -34,6 +35,8 @@ pub(super) struct Report {
     pub(super) off_model_orientation: Option<Section>,
     pub(super) faults: Faulty,
     pub(super) dual: Dual,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) arm: Option<Arm>,
 }
 
 /// Predictions of one side of the hand.
@@ -139,6 +142,37 @@ pub(super) struct FaultyCell {
     pub(super) overshoot_95: Option<f64>,
 }
 
+/// What the arm did with it.
+#[derive(Debug, Serialize)]
+pub(super) struct Arm {
+    pub(super) driven: usize,
+    /// Smallest and largest, tip metres per hand metre.
+    pub(super) scale: [f64; 2],
+    pub(super) ways: Vec<ArmWay>,
+    /// The guarded predictor's error over that of each other way: geometric mean over the folders.
+    pub(super) over_delayed_ideal: Option<f64>,
+    pub(super) over_delayed_same_arm: Option<f64>,
+    /// The same of each folder.
+    pub(super) of_groups: Vec<[Option<f64>; 2]>,
+    /// Share of the delay's cost that is gone, over all moments.
+    pub(super) fraction_hidden: Option<f64>,
+    /// Share of the performances whose lag is within 10 ms.
+    pub(super) lag_within_10_ms: f64,
+    pub(super) messages_per_s: f64,
+    /// Ticks on which a limit acted, of all that were judged.
+    pub(super) clamped: f64,
+}
+
+/// One way to follow the hand.
+#[derive(Debug, Serialize)]
+pub(super) struct ArmWay {
+    pub(super) name: &'static str,
+    /// In the hand's metres.
+    pub(super) rmse_mm: Option<f64>,
+    /// Lags of the performances: 10 % quantile, median, 90 % quantile.
+    pub(super) lag_ms: Option<[f64; 3]>,
+}
+
 /// Messages against error.
 #[derive(Debug, Serialize)]
 pub(super) struct Dual {
@@ -190,6 +224,7 @@ pub(super) fn report(plan: &Plan<'_>, rounds: &[Round], performances: &[Performa
         off_model_orientation: section(Side::Turn, true),
         faults: faulty(plan, performances),
         dual: dual(plan, performances),
+        arm: plan.arm.and_then(|_| arm(plan, performances)),
     }
 }
 
@@ -306,6 +341,74 @@ fn cell<'a>(groups: usize, tallies: impl Iterator<Item = (usize, &'a Tally)>, sc
         coverage: all.coverage(),
         worst,
     }
+}
+
+fn arm(plan: &Plan<'_>, performances: &[Performance]) -> Option<Arm> {
+    let driven: Vec<(usize, &Driven)> = performances
+        .iter()
+        .filter_map(|p| Some((p.set, p.driven.as_ref()?)))
+        .collect();
+    let error_2 = |way: usize, set: Option<usize>| -> f64 {
+        let own = driven
+            .iter()
+            .filter(|(s, _)| set.is_none_or(|set| set == *s));
+        own.map(|(_, one)| one.error_2[way]).sum()
+    };
+    let moments: usize = driven.iter().map(|(_, one)| one.moments).sum();
+    let rmse = |way: usize| finite((error_2(way, None) / moments as f64).sqrt());
+    let [ideal, delayed, own, known] = [0, 1, 2, 3];
+    let of_groups: Vec<[Option<f64>; 2]> = (0..plan.sets.len())
+        .map(|set| {
+            let over = |way| finite((error_2(own, Some(set)) / error_2(way, Some(set))).sqrt());
+            [over(ideal), over(delayed)]
+        })
+        .collect();
+    let mean = |n: usize| {
+        let ln: Option<Vec<f64>> = of_groups.iter().map(|r| Some(r[n]?.ln())).collect();
+        let ln = ln?;
+        finite((ln.iter().sum::<f64>() / ln.len() as f64).exp())
+    };
+    let (over_delayed_ideal, over_delayed_same_arm) = (mean(0), mean(1));
+    let ways = WAYS.iter().enumerate().map(|(way, name)| {
+        let mut lags: Vec<f64> = driven
+            .iter()
+            .filter_map(|(_, one)| one.lag_s[way].map(|s| s * 1e3))
+            .collect();
+        let mut lag = |q| quantile(&mut lags, q);
+        ArmWay {
+            name,
+            rmse_mm: rmse(way).map(|m| m * 1e3),
+            lag_ms: lag(0.1)
+                .zip(lag(0.5))
+                .zip(lag(0.9))
+                .map(|((a, b), c)| [a, b, c]),
+        }
+    });
+    let scales = || driven.iter().map(|(_, one)| one.scale);
+    let near = |one: &Driven| one.lag_s[own].is_some_and(|s| s.abs() <= 0.01);
+    let within = driven.iter().filter(|(_, one)| near(one)).count();
+    let (messages, seconds) = driven.iter().fold((0.0, 0.0), |(m, s), (_, one)| {
+        (m + f64::from(one.messages), s + one.duration_s)
+    });
+    let clamps: f64 = driven.iter().map(|(_, one)| f64::from(one.clamps)).sum();
+    (!driven.is_empty()).then(|| Arm {
+        driven: driven.len(),
+        scale: [
+            scales().fold(f64::INFINITY, f64::min),
+            scales().fold(0.0, f64::max),
+        ],
+        ways: ways.collect(),
+        over_delayed_ideal,
+        over_delayed_same_arm,
+        of_groups,
+        fraction_hidden: rmse(delayed)
+            .zip(rmse(own))
+            .zip(rmse(known))
+            .and_then(|((delayed, own), known)| finite((delayed - own) / (delayed - known))),
+        lag_within_10_ms: within as f64 / driven.len() as f64,
+        messages_per_s: messages / seconds,
+        clamped: clamps / moments as f64,
+    })
 }
 
 fn faulty(plan: &Plan<'_>, performances: &[Performance]) -> Faulty {

@@ -37,6 +37,7 @@ pub(super) fn text(report: &Report) -> String {
     }
     faults(&mut out, report);
     dual(&mut out, report);
+    arm(&mut out, report);
     out
 }
 
@@ -113,11 +114,20 @@ fn section(out: &mut String, report: &Report, title: &str, section: &Section) {
         let _ = writeln!(out, "no performance is predicted worse than 1.1 × holding");
     } else {
         let _ = writeln!(out, "performances predicted worse than 1.1 × holding:");
-        for one in &section.above {
+        for own in section
+            .above
+            .chunk_by(|a, b| (&a.group, &a.name) == (&b.group, &b.name))
+        {
+            let at: Vec<String> = own
+                .iter()
+                .map(|a| format!("{:.2} at {} ms", a.ratio, a.horizon_ms))
+                .collect();
             let _ = writeln!(
                 out,
-                "  {} ({}), {} ms: {:.2}",
-                one.name, one.group, one.horizon_ms, one.ratio
+                "  {} ({}): {}",
+                own[0].name,
+                own[0].group,
+                at.join(", ")
             );
         }
     }
@@ -226,5 +236,50 @@ fn bound(row: &DualRow) -> String {
         (Some(mm), _) => format!("{mm} mm"),
         (None, Some(n)) => format!("{n} σ"),
         (None, None) => String::new(),
+    }
+}
+
+fn arm(out: &mut String, report: &Report) {
+    let Some(arm) = &report.arm else {
+        return;
+    };
+    let [least, most] = arm.scale;
+    let _ = writeln!(
+        out,
+        "\n== through the arm: {} performances at scales {least:.3} to {most:.3} ==\n\
+         {:NAME$}{:>9}{:>26}",
+        arm.driven, "", "RMSE/mm", "lag/ms 10 %, median, 90 %"
+    );
+    for way in &arm.ways {
+        let lags = way.lag_ms.map_or_else(String::new, |lags| {
+            lags.iter().map(|lag| format!("{lag:>8.0}")).collect()
+        });
+        let _ = writeln!(
+            out,
+            "{:NAME$}{:>9}  {lags:>24}",
+            way.name,
+            number(way.rmse_mm, 1)
+        );
+    }
+    let _ = writeln!(
+        out,
+        "{} over delayed, same arm; {} over delayed, ideal tip; fraction hidden {}; lag within 10 ms in {:.0} %\n\
+         {:.1} messages/s; a limit acted on {:.1} % of the ticks",
+        number(arm.over_delayed_same_arm, 3),
+        number(arm.over_delayed_ideal, 3),
+        number(arm.fraction_hidden, 3),
+        100.0 * arm.lag_within_10_ms,
+        arm.messages_per_s,
+        100.0 * arm.clamped
+    );
+    if arm.of_groups.len() > 1 {
+        for (name, [ideal, same]) in report.position.groups.iter().zip(&arm.of_groups) {
+            let _ = writeln!(
+                out,
+                "{name:NAME$} {} over delayed, same arm; {} over ideal tip",
+                number(*same, 3),
+                number(*ideal, 3)
+            );
+        }
     }
 }
