@@ -9,6 +9,7 @@ mod arms;
 mod codec;
 mod commands;
 mod data;
+mod evaluate;
 mod frames;
 mod ingest;
 mod layout;
