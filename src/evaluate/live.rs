@@ -10,7 +10,8 @@ use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::turn::WireRotation;
 use telemime_protocol::wire::v1::{
-    Info, Message, Motion, OperatorDatagram, RobotControl, RobotDatagram, RobotState, Telemetry,
+    Info, MAX_TAIL_KNOTS, Message, Motion, OperatorDatagram, RobotControl, RobotDatagram,
+    RobotState, Telemetry,
 };
 use telemime_protocol::wire::{frame::Frame, v1::model_tag};
 
@@ -173,10 +174,12 @@ impl Live {
         let known = motion.model == model_tag(&self.skill.id().0);
         let skill = known.then_some(&*self.skill);
         let (state, params) = (motion.state.dequantise(), motion.params.dequantise());
+        let knots = motion.knots.count(MAX_TAIL_KNOTS);
+        let knots = knots.expect("a decoded message was checked") as u32;
         Said {
             at_s,
             bytes,
-            knots: motion.first_knot..motion.first_knot + motion.knots.len() as u32,
+            knots: motion.first_knot..motion.first_knot + knots,
             place: match skill {
                 Some(skill) => skill.predictor().forecast(&state, &params),
                 None => Forecast::constant_velocity(&state, &params),
