@@ -2,10 +2,12 @@
 
 use std::sync::Arc;
 
+use nalgebra::Vector3;
 use telemime_operator::demonstration::Demonstration;
 use telemime_operator::session::{FutureBound, SessionConfig};
-use telemime_protocol::predict::{Forecast, HandState, Params};
+use telemime_protocol::predict::{Forecast, HandState};
 use telemime_protocol::skill::Skill;
+use telemime_protocol::time::Stamp;
 use telemime_sim::link::{Fate, Link, LinkConfig};
 
 use super::live::{Live, Said, on_session_clock};
@@ -15,16 +17,6 @@ const HEADERS: usize = 58;
 
 /// Longer than any recording: no heartbeat.
 const NEVER_S: f64 = 1e4;
-
-const HOLD: Params = Params {
-    gain: 0.0,
-    ..Params::DEFAULT
-};
-const STRAIGHT: Params = Params {
-    gain: 1.0,
-    trust: 0.0,
-    cv_damping: 1.0,
-};
 
 /// When to speak, and what the robot makes of it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -65,10 +57,38 @@ impl Outcome {
     }
 }
 
+/// What the robot makes of a message.
+#[derive(Clone, Copy)]
+enum Told {
+    /// The hand was there, and may move on at this velocity (m/s).
+    Straight(Stamp, Vector3<f64>, Vector3<f64>),
+    /// As the session has it.
+    Guarded(Forecast),
+}
+
+impl Told {
+    /// When what was told was valid.
+    fn t(&self) -> Stamp {
+        match self {
+            Self::Straight(t, ..) => *t,
+            Self::Guarded(forecast) => forecast.t,
+        }
+    }
+
+    /// The hand at `t`, m.
+    fn at(&self, t: Stamp) -> Vector3<f64> {
+        let ahead_s = t.secs_since(self.t());
+        match self {
+            Self::Straight(_, x, v) => x + v * ahead_s,
+            Self::Guarded(forecast) => forecast.at(ahead_s).position,
+        }
+    }
+}
+
 /// What the robot knows from when on.
 struct Arrival {
     at_s: f64,
-    forecast: Forecast,
+    told: Told,
 }
 
 /// Something happens at the robot, or the operator hears of it.
@@ -91,55 +111,56 @@ pub(super) fn run(
         ..Outcome::default()
     };
     let arrivals = match scheme {
-        Scheme::Everything => by_rule(d, &mut wire, &mut outcome, HOLD, 0.0),
-        Scheme::DeadbandHold(bound_m) => by_rule(d, &mut wire, &mut outcome, HOLD, bound_m),
-        Scheme::DeadbandStraight(bound_m) => by_rule(d, &mut wire, &mut outcome, STRAIGHT, bound_m),
+        Scheme::Everything => by_rule(d, &mut wire, &mut outcome, 0.0, 0.0),
+        Scheme::DeadbandHold(bound_m) => by_rule(d, &mut wire, &mut outcome, 0.0, bound_m),
+        Scheme::DeadbandStraight(bound_m) => by_rule(d, &mut wire, &mut outcome, 1.0, bound_m),
         Scheme::Session(bound, silence_s) => {
             by_session(d, skill, &mut wire, &mut outcome, bound, silence_s)
         }
     };
     // Before the first message can have come there is nothing to be judged.
     let from_s = d.samples()[0].t_s + link.delay_s + link.jitter_s - 1e-6;
-    let start = HandState::first(on_session_clock(0.0), d.samples()[0].position);
-    let start = Forecast::constant_velocity(&start, &HOLD);
+    let first = d.samples()[0].position;
+    let start = Told::Straight(on_session_clock(0.0), first, Vector3::zeros());
     for now in d.samples().iter().filter(|s| s.t_s >= from_s) {
         let newest = arrivals
             .iter()
             .filter(|a| a.at_s <= now.t_s + 1e-6)
-            .max_by_key(|a| a.forecast.t)
-            .map_or(start, |a| a.forecast);
-        let ahead_s = on_session_clock(now.t_s).secs_since(newest.t);
-        outcome.error_2 += (newest.at(ahead_s).position - now.position).norm_squared();
+            .max_by_key(|a| a.told.t())
+            .map_or(start, |a| a.told);
+        let known = newest.at(on_session_clock(now.t_s));
+        outcome.error_2 += (known - now.position).norm_squared();
         outcome.moments += 1;
     }
     outcome
 }
 
-/// Deadbands: the sender looks at the present. A bound of 0 sends everything.
+/// Deadbands: the sender looks at the present; the robot goes on at `factor` of the velocity. A bound of 0
+/// sends everything.
 fn by_rule(
     d: &Demonstration,
     wire: &mut Link,
     outcome: &mut Outcome,
-    params: Params,
+    factor: f64,
     bound_m: f64,
 ) -> Vec<Arrival> {
     let mut arrivals = Vec::new();
     let mut state: Option<HandState> = None;
-    let mut sent: Option<Forecast> = None;
+    let mut sent: Option<Told> = None;
     for s in d.samples() {
         let t = on_session_clock(s.t_s);
         let hand = state.get_or_insert_with(|| HandState::first(t, s.position));
         hand.advance(t, s.position);
-        let off = |f: &Forecast| (f.at(t.secs_since(f.t)).position - s.position).norm() > bound_m;
-        if bound_m > 0.0 && sent.as_ref().is_some_and(|f| !off(f)) {
+        let off = |told: &Told| (told.at(t) - s.position).norm() > bound_m;
+        if bound_m > 0.0 && sent.as_ref().is_some_and(|told| !off(told)) {
             continue;
         }
-        let forecast = Forecast::constant_velocity(hand, &params);
-        sent = Some(forecast);
+        let told = Told::Straight(t, s.position, hand.motion().0 * factor);
+        sent = Some(told);
         outcome.messages += 1;
         if let Fate::Deliver { at_ns } = wire.send(ns(s.t_s), HEADERS) {
             let at_s = at_ns as f64 * 1e-9;
-            arrivals.push(Arrival { at_s, forecast });
+            arrivals.push(Arrival { at_s, told });
         }
     }
     arrivals
@@ -208,7 +229,7 @@ fn send(
             news.push((at_s, News::Arrival(said.knots)));
             arrivals.push(Arrival {
                 at_s,
-                forecast: said.place,
+                told: Told::Guarded(said.place),
             });
         }
     }
