@@ -100,9 +100,13 @@ fn messages(report: &Report) -> Panel {
     layers.extend(series("deadband, velocity", ORANGE, &|s| {
         matches!(s, Scheme::DeadbandStraight(_))
     }));
-    layers.extend(series("silence ≤ 200 ms", BLUE, &session(Some(0.2))));
+    layers.extend(series(
+        "guarded, silence ≤ 200 ms",
+        BLUE,
+        &session(Some(0.2)),
+    ));
     layers.extend(series("≤ 300 ms", SKY, &session(Some(0.3))));
-    layers.extend(series("unlimited", GREEN, &session(None)));
+    layers.extend(series("no limit", GREEN, &session(None)));
     Panel {
         title: format!(
             "Messages against error, {} ± {} ms, {} % lost",
