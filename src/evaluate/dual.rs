@@ -238,3 +238,74 @@ fn send(
 fn ns(t_s: f64) -> i64 {
     (t_s * 1e9).round() as i64
 }
+
+#[cfg(test)]
+mod tests {
+    use telemime_operator::demonstration::Sample;
+    use telemime_operator::learn::{LearnOptions, learn_skill};
+
+    use super::*;
+
+    fn straight_on() -> Demonstration {
+        let at = |i: i32| f64::from(i) / 30.0;
+        let samples: Vec<_> = (0..90)
+            .map(|i| Sample::at(at(i), Vector3::new(2.0 * at(i), 0.0, 1.0)))
+            .collect();
+        Demonstration::from_samples("straight", &samples).unwrap()
+    }
+
+    fn skill() -> Arc<Skill> {
+        let options = LearnOptions {
+            motion_components: 2..=2,
+            ..LearnOptions::default()
+        };
+        Arc::new(learn_skill("straight", &[straight_on()], &options, |_| ()).unwrap())
+    }
+
+    fn slow(loss: f64) -> LinkConfig {
+        LinkConfig {
+            delay_s: 0.1,
+            loss,
+            ..LinkConfig::default()
+        }
+    }
+
+    #[test]
+    fn holding_over_a_link_errs_by_the_way_of_its_delay() {
+        let (d, skill) = (straight_on(), skill());
+        let held = run(Scheme::Everything, &d, &skill, &slow(0.0), 1);
+        assert_eq!(held.messages, 90);
+        assert!((held.rmse_m().unwrap() - 0.2).abs() < 1e-6);
+        // Half of the samples are late by one more interval, or by several.
+        let lossy = run(Scheme::Everything, &d, &skill, &slow(0.5), 1);
+        assert!(lossy.rmse_m().unwrap() > 0.22);
+        assert_eq!(lossy.messages, 90, "what is lost was sent");
+    }
+
+    #[test]
+    fn a_deadband_sends_what_it_must_and_dead_reckoning_less() {
+        let (d, skill) = (straight_on(), skill());
+        let send = |scheme| run(scheme, &d, &skill, &slow(0.0), 1);
+        // 6.7 cm from sample to sample: every third is more than 15 cm on.
+        assert_eq!(send(Scheme::DeadbandHold(0.15)).messages, 30);
+        let reckoned = send(Scheme::DeadbandStraight(0.01));
+        assert!(reckoned.messages < 15, "{}", reckoned.messages);
+        assert!(reckoned.rmse_m() < send(Scheme::DeadbandHold(0.01)).rmse_m());
+    }
+
+    #[test]
+    fn a_session_speaks_when_silence_grows_too_long_and_its_knots_are_acknowledged() {
+        let (d, skill) = (straight_on(), skill());
+        let session = |silence_s| {
+            let never = FutureBound::Absolute(1e3);
+            run(Scheme::Session(never, silence_s), &d, &skill, &slow(0.0), 1)
+        };
+        // The first sample, and then a word every 0.2 s of 2.97 s.
+        assert_eq!(session(Some(0.2)).messages, 15);
+        assert_eq!(session(None).messages, 1);
+        let everything = FutureBound::Absolute(1e-9);
+        let all = run(Scheme::Session(everything, None), &d, &skill, &slow(0.0), 1);
+        assert!(all.bytes > all.messages * HEADERS);
+        assert!(all.bytes < all.messages * (HEADERS + 90), "{} B", all.bytes);
+    }
+}

@@ -6,7 +6,9 @@ use nalgebra::{Matrix3, Vector1, Vector3};
 use telemime_operator::demonstration::{Demonstration, Sample};
 use telemime_operator::session::SessionConfig;
 use telemime_protocol::pose;
-use telemime_protocol::predict::{Calibration, HandState, KNOT_SPACING_S, Posterior, TurnState};
+use telemime_protocol::predict::{
+    Ahead, Calibration, HandState, KNOT_SPACING_S, MAX_KNOTS, Posterior, TurnState,
+};
 use telemime_protocol::skill::{Gmr, Skill};
 use telemime_protocol::time::Stamp;
 
@@ -36,36 +38,24 @@ impl Side {
     }
 }
 
-/// How sure a prediction is of itself.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Spread {
-    /// Standard deviation along any one axis.
-    Ball(f64),
-    /// Covariance.
-    Region(Matrix3<f64>),
-}
-
 /// Variances below this are a sensor at rest, not precision, m² or rad².
 const LEAST_2: f64 = 1e-8;
-
-impl Spread {
-    /// The squared Mahalanobis distance of an error.
-    pub(super) fn distance2(&self, error: &Vector3<f64>) -> Option<f64> {
-        match self {
-            Self::Ball(sigma) => Some(error.norm_squared() / (sigma * sigma + LEAST_2)),
-            Self::Region(covariance) => {
-                let covariance = covariance + Matrix3::identity() * LEAST_2;
-                Some(error.dot(&covariance.cholesky()?.solve(error)))
-            }
-        }
-    }
-}
 
 /// A predicted way from the newest sample.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Guess {
     pub(super) way: Vector3<f64>,
-    pub(super) spread: Option<Spread>,
+    /// Its covariance, where the predictor states one.
+    pub(super) spread: Option<Matrix3<f64>>,
+}
+
+impl Guess {
+    /// The squared Mahalanobis distance of what came; `None` without a covariance.
+    pub(super) fn distance2(&self, truth: &Vector3<f64>) -> Option<f64> {
+        let covariance = self.spread? + Matrix3::identity() * LEAST_2;
+        let error = self.way - truth;
+        Some(error.dot(&covariance.cholesky()?.solve(&error)))
+    }
 }
 
 impl From<Vector3<f64>> for Guess {
@@ -79,8 +69,8 @@ pub(super) trait Expert {
     /// Takes the next sample.
     fn take(&mut self, sample: &Sample);
 
-    /// The way from the newest sample to `horizons_s[n]` later.
-    fn ahead(&self, n: usize, h_s: f64) -> Guess;
+    /// The way from the newest sample to `h_s` later.
+    fn ahead(&self, h_s: f64) -> Guess;
 
     /// Squared Mahalanobis distance of the newest state to what was learned, in multiples of the calibrated
     /// 90 % quantile; `None` of predictors that have learned nothing.
@@ -90,10 +80,11 @@ pub(super) trait Expert {
 }
 
 /// Names, in the order of [`experts`].
-pub(super) const PLACE_NAMES: [&str; 7] = [
+pub(super) const PLACE_NAMES: [&str; 8] = [
     "hold",
     "constant velocity",
     "damped velocity ×0.5",
+    "generic",
     "Kalman",
     "clock-indexed GMR",
     "mixture alone",
@@ -101,10 +92,11 @@ pub(super) const PLACE_NAMES: [&str; 7] = [
 ];
 
 /// The same of orientations.
-pub(super) const TURN_NAMES: [&str; 6] = [
+pub(super) const TURN_NAMES: [&str; 7] = [
     "hold",
     "constant velocity",
     "damped velocity ×0.5",
+    "generic",
     "clock-indexed GMR",
     "mixture alone",
     GUARDED,
@@ -114,14 +106,14 @@ pub(super) const TURN_NAMES: [&str; 6] = [
 pub(super) const GUARDED: &str = "guarded";
 
 /// All of them, for one performance. `kalman` was tuned on what `skill` was learned from.
-pub(super) fn experts(
-    side: Side,
-    skill: &Arc<Skill>,
-    kalman: &Kalman,
-    horizons_s: &[f64],
-) -> Vec<Box<dyn Expert>> {
+pub(super) fn experts(side: Side, skill: &Arc<Skill>, kalman: &Kalman) -> Vec<Box<dyn Expert>> {
     let damped = |factor: f64| -> Box<dyn Expert> { Box::new(Straight::new(side, factor)) };
     let mut all = vec![damped(0.0), damped(1.0), damped(0.5)];
+    all.push(Box::new(Generic {
+        side,
+        skill: Arc::clone(skill),
+        hand: None,
+    }));
     if side == Side::Place {
         all.push(Box::new(kalman.clone()));
     }
@@ -132,7 +124,7 @@ pub(super) fn experts(
         hand: None,
         posterior: None,
     }));
-    all.push(Box::new(Guarded::new(side, skill, horizons_s)));
+    all.push(Box::new(Guarded::new(side, skill)));
     all
 }
 
@@ -187,9 +179,45 @@ impl Expert for Straight {
         };
     }
 
-    fn ahead(&self, _: usize, h_s: f64) -> Guess {
+    fn ahead(&self, h_s: f64) -> Guess {
         (self.velocity * (self.factor * h_s)).into()
     }
+}
+
+/// A fixed linear rule on the memories, for any motion of this speed.
+struct Generic {
+    side: Side,
+    skill: Arc<Skill>,
+    hand: Option<Hand>,
+}
+
+impl Expert for Generic {
+    fn take(&mut self, sample: &Sample) {
+        Hand::take(&mut self.hand, sample);
+    }
+
+    fn ahead(&self, h_s: f64) -> Guess {
+        let turn = self.skill.turn().map(|turn| turn.predictor.model());
+        let (model, ways) = match (self.side, &self.hand, turn) {
+            (Side::Place, Some(hand), _) => (self.skill.predictor(), hand.place.ways()),
+            (Side::Turn, Some(Hand { turn: Some(q), .. }), Some(model)) => (model, q.ways()),
+            _ => return Vector3::zeros().into(),
+        };
+        let lead = &model.generic().lead;
+        let knot = |j: usize| match j.checked_sub(1) {
+            None => Vector3::zeros(),
+            Some(i) => ways.iter().zip(lead).map(|(way, lead)| way * lead[i]).sum(),
+        };
+        let (j, s) = between(h_s);
+        Vector3::lerp(&knot(j), &knot(j + 1), s).into()
+    }
+}
+
+/// The knot before a horizon, and how far it is to the next, from 0 to 1.
+fn between(h_s: f64) -> (usize, f64) {
+    let u = h_s / KNOT_SPACING_S;
+    let j = (u as usize).min(MAX_KNOTS - 1);
+    (j, u - j as f64)
 }
 
 /// The publication's regression over time: where the skill is that long after the recording's beginning.
@@ -220,7 +248,7 @@ impl Expert for Clock {
         self.newest = Some(*sample);
     }
 
-    fn ahead(&self, _: usize, h_s: f64) -> Guess {
+    fn ahead(&self, h_s: f64) -> Guess {
         let Some(now) = &self.newest else {
             return Vector3::zeros().into();
         };
@@ -239,7 +267,7 @@ impl Expert for Clock {
         };
         Guess {
             way,
-            spread: Some(Spread::Region(covariance)),
+            spread: Some(covariance),
         }
     }
 }
@@ -274,7 +302,7 @@ impl Expert for Mixture {
         };
     }
 
-    fn ahead(&self, _: usize, h_s: f64) -> Guess {
+    fn ahead(&self, h_s: f64) -> Guess {
         let (Some(p), Some(c)) = (&self.posterior, self.calibration()) else {
             return Vector3::zeros().into();
         };
@@ -282,13 +310,11 @@ impl Expert for Mixture {
             None => (Vector3::zeros(), Matrix3::zeros()),
             Some(i) => (p.displacement[i], p.covariance[i] * c.covariance[i]),
         };
-        let u = h_s / KNOT_SPACING_S;
-        let j = (u as usize).min(p.displacement.len() - 1);
-        let s = u - j as f64;
+        let (j, s) = between(h_s);
         let ((a, a_2), (b, b_2)) = (knot(j), knot(j + 1));
         Guess {
             way: a.lerp(&b, s),
-            spread: Some(Spread::Region(a_2 * (1.0 - s) + b_2 * s)),
+            spread: Some(a_2 * (1.0 - s) + b_2 * s),
         }
     }
 
@@ -297,63 +323,72 @@ impl Expert for Mixture {
     }
 }
 
-/// What the robot predicts from a session that sends every sample, as the wire carries it: one session a
-/// horizon, because a session adapts to the delay it has.
+/// What the robot predicts from a session that sends every sample, as the wire carries it.
 struct Guarded {
     side: Side,
-    sessions: Vec<(Live, Option<Said>)>,
+    session: Live,
+    said: Option<Said>,
     newest: Option<Sample>,
 }
 
+/// The delay of the guarded predictor's link, s. Nothing that it sends depends on it.
+const DELAY_S: f64 = 0.1;
+
 impl Guarded {
-    fn new(side: Side, skill: &Arc<Skill>, horizons_s: &[f64]) -> Self {
+    fn new(side: Side, skill: &Arc<Skill>) -> Self {
         let config = SessionConfig {
             max_silence_s: 0.0,
             min_interval_s: 0.0,
             ..SessionConfig::default()
         };
-        let session = |h_s: &f64| (Live::new(skill, config, *h_s), None);
         Self {
             side,
-            sessions: horizons_s.iter().map(session).collect(),
+            session: Live::new(skill, config, DELAY_S),
+            said: None,
             newest: None,
         }
     }
 }
 
+/// The covariance of a forecast `h_s` after the state it starts from.
+fn covariance(ahead: &Ahead, h_s: f64) -> Matrix3<f64> {
+    let knot = |j: usize| {
+        let [xx, xy, xz, yy, yz, zz] = ahead.knots[j.min(ahead.count)].covariance;
+        Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+    };
+    let (j, s) = between(h_s);
+    knot(j) * (1.0 - s) + knot(j + 1) * s
+}
+
 impl Expert for Guarded {
     fn take(&mut self, sample: &Sample) {
         self.newest = Some(*sample);
-        for (session, newest) in &mut self.sessions {
-            if let Some(said) = session.take(sample).pop() {
-                *newest = Some(said);
-            }
+        if let Some(said) = self.session.take(sample).pop() {
+            self.said = Some(said);
         }
     }
 
-    fn ahead(&self, n: usize, h_s: f64) -> Guess {
-        let (Some(now), Some(said)) = (&self.newest, &self.sessions[n].1) else {
+    fn ahead(&self, h_s: f64) -> Guess {
+        let (Some(now), Some(said)) = (&self.newest, &self.said) else {
             return Vector3::zeros().into();
         };
         let at = on_session_clock(now.t_s + h_s);
-        match self.side {
-            Side::Place => {
-                let p = said.place.at(at.secs_since(said.place.t));
-                Guess {
-                    way: p.position - now.position,
-                    spread: Some(Spread::Ball(p.sigma_m)),
-                }
+        let (way, covariance) = match (self.side, &said.turn, now.orientation) {
+            (Side::Place, ..) => {
+                let ahead_s = at.secs_since(said.place.t);
+                let way = said.place.at(ahead_s).position - now.position;
+                (way, covariance(&said.place.ahead, ahead_s))
             }
-            Side::Turn => match (&said.turn, now.orientation) {
-                (Some(turn), Some(q)) => {
-                    let p = turn.at(at.secs_since(turn.t));
-                    Guess {
-                        way: pose::between(&q, &p.orientation),
-                        spread: Some(Spread::Ball(p.sigma_rad)),
-                    }
-                }
-                _ => Vector3::zeros().into(),
-            },
+            (Side::Turn, Some(turn), Some(q)) => {
+                let ahead_s = at.secs_since(turn.t);
+                let way = pose::between(&q, &turn.at(ahead_s).orientation);
+                (way, covariance(&turn.ahead, ahead_s))
+            }
+            _ => return Vector3::zeros().into(),
+        };
+        Guess {
+            way,
+            spread: Some(covariance),
         }
     }
 }

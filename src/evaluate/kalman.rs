@@ -43,7 +43,7 @@ impl Kalman {
                 let ahead = samples.map(|s| {
                     filter.take(s);
                     let truth = d.position_at(s.t_s + CHOSEN_AT_S) - s.position;
-                    (filter.ahead(0, CHOSEN_AT_S).way - truth).norm_squared()
+                    (filter.ahead(CHOSEN_AT_S).way - truth).norm_squared()
                 });
                 ahead.sum::<f64>()
             });
@@ -102,7 +102,7 @@ impl Expert for Kalman {
         self.covariance = (self.covariance + self.covariance.transpose()) * 0.5;
     }
 
-    fn ahead(&self, _: usize, h_s: f64) -> Guess {
+    fn ahead(&self, h_s: f64) -> Guess {
         let ahead = Self::transition(h_s) * self.state;
         (ahead.row(0).transpose() - self.newest).into()
     }

@@ -316,7 +316,7 @@ impl Plan<'_> {
     ) -> Result<Performance, EvaluateError> {
         let mut novelty = Vec::new();
         let mut perform = |side: Side| {
-            let mut experts = experts(side, skill, kalman, self.horizons_s);
+            let mut experts = experts(side, skill, kalman);
             perform(side, d, &mut experts, self.horizons_s, |expert| {
                 if side == Side::Place {
                     novelty.extend(expert.novelty());
@@ -336,7 +336,7 @@ impl Plan<'_> {
         };
         let changed = faults::change_of_mind(d).filter(|_| off.is_none());
         let mind = changed.map(|(changed, turn_s)| {
-            let mut experts = experts(Side::Place, skill, kalman, &[MIND_AT_S]);
+            let mut experts = experts(Side::Place, skill, kalman);
             faults::around(&changed, turn_s, &mut experts, MIND_AT_S)
         });
         let tallies = |side, courses: &[Vec<Course>]| {
@@ -391,5 +391,98 @@ impl Plan<'_> {
             each.map(|(course, h_s)| of(course, *h_s)).collect()
         };
         courses.iter().map(row).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use telemime_operator::demonstration::Sample;
+
+    use super::*;
+
+    fn set(name: &str, files: &[&str]) -> Demonstrations {
+        let recording = |file: &&str| {
+            // Every name another recording: what was learned is known by its content.
+            let offset = file.bytes().map(f64::from).sum::<f64>() * 1e-3 + name.len() as f64;
+            let at = |i: i32| Sample::at(f64::from(i) * 0.1, Vector3::repeat(offset));
+            let samples: Vec<_> = (0..8).map(at).collect();
+            Demonstration::from_samples(file, &samples).unwrap()
+        };
+        Demonstrations {
+            name: name.to_owned(),
+            demonstrations: files.iter().map(recording).collect(),
+            notices: Vec::new(),
+        }
+    }
+
+    fn rounds(
+        sets: &[Demonstrations],
+        off_model: &[Demonstrations],
+        protocol: Protocol,
+        most: usize,
+    ) -> Result<Vec<Round>, EvaluateError> {
+        let plan = Plan {
+            sets,
+            off_model,
+            protocol,
+            persons: &PersonPattern::default(),
+            most,
+            horizons_s: &[0.1],
+            schemes: &[],
+            link: &LinkConfig::default(),
+            arm: None,
+            seed: 0,
+        };
+        plan.rounds()
+    }
+
+    #[test]
+    fn what_is_predicted_was_never_learned_from_and_is_predicted_once() {
+        let sets = [
+            set(
+                "a",
+                &["a_s1_t1", "a_s1_t2", "a_s2_t1", "a_s2_t2", "a_s3_t1"],
+            ),
+            set("b", &["b_s1_t1", "b_s2_t1", "b_s2_t2"]),
+        ];
+        for (protocol, predicted) in [
+            // Those whose person performed once have nobody to learn from.
+            (Protocol::SamePerson, 6),
+            (Protocol::LeaveOneOut, 8),
+            (Protocol::Cross, 8),
+        ] {
+            let rounds = rounds(&sets, &[], protocol, 2).unwrap();
+            let mut tried: Vec<_> = rounds
+                .iter()
+                .flat_map(|r| r.test.iter().map(|n| (r.set, *n)))
+                .collect();
+            for r in &rounds {
+                assert!((1..=2).contains(&r.learn.len()), "{r:?}");
+                assert!(r.test.iter().all(|n| !r.learn.contains(n)), "{r:?}");
+            }
+            let count = tried.len();
+            tried.sort_unstable();
+            tried.dedup();
+            assert_eq!((count, tried.len()), (predicted, predicted), "{protocol:?}");
+        }
+        let cross = rounds(&sets, &[], Protocol::Cross, 9).unwrap();
+        assert_eq!(cross[0].test, [0, 1]);
+        assert_eq!(cross[0].learn, [2, 3, 4]);
+    }
+
+    #[test]
+    fn off_the_model_is_the_same_person_with_another_gesture() {
+        let sets = [
+            set("a", &["a_s1_t1", "a_s1_t2"]),
+            set("bb", &["b_s1_t1", "b_s1_t2", "b_s9_t1"]),
+        ];
+        let all = rounds(&sets[..1], &sets, Protocol::SamePerson, 3).unwrap();
+        let [.., off] = all.as_slice() else {
+            panic!("{all:?}");
+        };
+        assert!(off.test.is_empty());
+        assert_eq!(off.learn, [0, 1]);
+        // Neither what was learned from, nor who else is there.
+        assert_eq!(off.off, [(1, 0), (1, 1)]);
     }
 }

@@ -141,7 +141,7 @@ pub(super) fn perform(
                 if let Some(truth) = truths[n] {
                     course.push(Moment {
                         sample,
-                        guess: expert.ahead(n, *h_s),
+                        guess: expert.ahead(*h_s),
                         truth,
                     });
                 }
@@ -159,7 +159,7 @@ pub(super) fn tally(side: Side, d: &Demonstration, course: &Course, h_s: f64) ->
         tally.moments += 1;
         tally.error_2 += error.norm_squared();
         tally.hold_2 += m.truth.norm_squared();
-        if let Some(distance2) = m.guess.spread.and_then(|s| s.distance2(&error)) {
+        if let Some(distance2) = m.guess.distance2(&m.truth) {
             tally.regions += 1;
             for (held, (_, quantile)) in tally.held.iter_mut().zip(REGIONS) {
                 *held += usize::from(distance2 <= quantile);
@@ -197,10 +197,10 @@ pub(super) fn jerk(t: &[f64; 4], mut x: [Vector3<f64>; 4]) -> Vector3<f64> {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Matrix3;
     use telemime_operator::demonstration::Sample;
 
     use super::*;
-    use crate::evaluate::experts::Spread;
 
     /// A hand on a circle, sampled unevenly.
     fn circle() -> Demonstration {
@@ -230,11 +230,11 @@ mod tests {
                 .unwrap();
         }
 
-        fn ahead(&self, _: usize, h_s: f64) -> Guess {
+        fn ahead(&self, h_s: f64) -> Guess {
             let t_s = self.d.samples()[self.now].t_s + h_s - self.by_s;
             Guess {
                 way: Side::Place.way(&self.d, self.now, t_s),
-                spread: Some(Spread::Ball(1e-3)),
+                spread: Some(Matrix3::identity() * 1e-6),
             }
         }
     }
