@@ -11,6 +11,7 @@ macro_rules! say {
 pub mod cli;
 mod codec;
 mod demo;
+mod evaluate;
 mod figure;
 pub mod ground;
 mod ingest;

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 14] = [
+const COMMANDS: [&str; 15] = [
     "demo",
     "import",
     "learn",
@@ -13,6 +13,7 @@ const COMMANDS: [&str; 14] = [
     "recognise",
     "confusion",
     "select",
+    "evaluate",
     "codec",
     "robot",
     "operator",

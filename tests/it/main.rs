@@ -9,6 +9,7 @@ mod arms;
 mod codec;
 mod commands;
 mod data;
+mod evaluate;
 mod floods;
 mod frames;
 mod gate;
