@@ -20,4 +20,5 @@ mod picture;
 mod recognise;
 pub mod relay;
 mod select;
+mod tap;
 mod teach;

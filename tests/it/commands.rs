@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 13] = [
+const COMMANDS: [&str; 14] = [
     "demo",
     "import",
     "learn",
@@ -17,6 +17,7 @@ const COMMANDS: [&str; 13] = [
     "robot",
     "operator",
     "link",
+    "tap",
     "paper",
 ];
 
