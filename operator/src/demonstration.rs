@@ -256,6 +256,20 @@ impl Demonstration {
         Self::parse(name, csv_text(&[], samples).as_bytes())
     }
 
+    /// The same path in 1/`pace` of the time; name and hash stay.
+    pub(crate) fn paced(&self, pace: f64) -> Self {
+        let mut copy = self.clone();
+        copy.samples.iter_mut().for_each(|s| s.t_s /= pace);
+        copy
+    }
+
+    /// The same motion, `by` (m) from here; name, hash and frames stay.
+    pub(crate) fn shifted(&self, by: &Vector3<f64>) -> Self {
+        let mut copy = self.clone();
+        copy.samples.iter_mut().for_each(|s| s.position += by);
+        copy
+    }
+
     /// Whether every sample has an orientation.
     pub fn has_orientation(&self) -> bool {
         self.samples.iter().all(|s| s.orientation.is_some())

@@ -8,8 +8,7 @@ use std::path::Path;
 use crate::data::{data, needs};
 use nalgebra::{SMatrix, Vector3};
 use telemime_operator::demonstration::Demonstration;
-use telemime_operator::learn::PredictorOptions;
-use telemime_operator::learn::predictor::{states, train, train_from_labels};
+use telemime_operator::learn::predictor::{Character, PredictorOptions, states, train, train_from_labels};
 use telemime_protocol::predict::{Forecast, KNOT_SPACING_S, Model, Params};
 
 fn array<const N: usize>(v: &serde_json::Value) -> [f64; N] {
@@ -47,6 +46,12 @@ fn the_reference_answer_is_reproduced() {
         .collect();
     let options = PredictorOptions {
         knots: 9,
+        characters: vec![Character {
+            bend: 0.0,
+            ..Character::ABRUPT
+        }],
+        copies: 0.0,
+        as_queried: false,
         ..PredictorOptions::default()
     };
     let model = train_from_labels(&demos, &labels, &options).unwrap();
@@ -197,7 +202,7 @@ fn evaluate(groups: &[Vec<Demonstration>], most: usize) -> Scores {
             if others.is_empty() {
                 continue;
             }
-            let model = train(&others, &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
+            let model = train(&others, &[], &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
             score(&model, test, &mut scores);
         }
     }

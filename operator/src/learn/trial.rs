@@ -50,6 +50,8 @@ pub(super) struct Trial<C> {
     knots: usize,
     damping: f64,
     straight_m2: [f64; MAX_KNOTS],
+    /// Σ|error of the mixture|² at each knot, and what holding makes of the same samples.
+    mixture_m2: [[f64; 2]; MAX_KNOTS],
     /// Σ|truth|² at each knot, by which errors at different horizons are made comparable.
     moved_m2: [f64; MAX_KNOTS],
     trust: Slope,
@@ -88,6 +90,7 @@ impl<C: Course> Trial<C> {
             knots,
             damping,
             straight_m2,
+            mixture_m2: [[0.0; 2]; MAX_KNOTS],
             moved_m2,
             trust: Slope::default(),
             nees: vec![Vec::new(); knots],
@@ -114,6 +117,8 @@ impl<C: Course> Trial<C> {
                 if let Some(c) = covariance.cholesky() {
                     self.nees[j - 1].push(e.dot(&c.solve(&e)));
                 }
+                self.mixture_m2[j - 1][0] += e.norm_squared();
+                self.mixture_m2[j - 1][1] += truth.norm_squared();
                 if CHOSEN_BY.contains(&j) {
                     let straight = velocity * h_s;
                     let apart = p.displacement[j - 1] - straight;
@@ -122,6 +127,13 @@ impl<C: Course> Trial<C> {
                 }
             }
         }
+    }
+
+    /// The mixture's squared error over that of holding, summed over the knots that count; 0 of none.
+    pub(super) fn ratio(&self) -> f64 {
+        let tried = CHOSEN_BY.filter_map(|j| self.mixture_m2.get(j - 1));
+        let each = tried.filter(|[_, hold]| *hold > 0.0).map(|[e, hold]| e / hold);
+        each.sum()
     }
 
     /// The share of the states tried whose novelty is above `limit`; 0 of none.

@@ -7,14 +7,16 @@
 mod ahead;
 mod forecast;
 mod model;
+mod standard;
 mod state;
 mod turn;
 
 pub use ahead::{Ahead, Knot, Way};
 pub use forecast::{Forecast, Params, ParamsError, Prediction};
 pub use model::{
-    BLOCK, Calibration, Model, ModelError, Posterior, Regression, Standardisation, TARGETS, TEMPER,
+    BLOCK, Calibration, Model, ModelError, Posterior, Regression, TARGETS, TEMPER,
 };
+pub use standard::{BENT, Standardisation};
 pub use state::{FEATURES, HandState, MEMORY_TAU_S};
 pub use turn::{TurnForecast, TurnModel, TurnPrediction, TurnState, checksum};
 

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::SkillError;
 use super::bytes::triangle;
 use crate::predict::{
-    BLOCK, Calibration, FEATURES, MAX_KNOTS, Model, ModelError, Params, Regression,
+    BENT, BLOCK, Calibration, FEATURES, MAX_KNOTS, Model, ModelError, Params, Regression,
     Standardisation, TARGETS,
 };
 use crate::wire::codec::DecodeError;
@@ -38,6 +38,9 @@ const EXPONENTS: core::ops::RangeInclusive<i8> = -40..=20;
 pub(super) struct RawModel {
     mean: [f32; FEATURES],
     scale: [f32; FEATURES],
+    bend: [f32; BENT],
+    /// Ridge and shrinkage.
+    training: [f32; 2],
     /// One factor a knot: its length is the number of knots.
     covariance: Vec<f32>,
     straight_m2: Vec<f32>,
@@ -108,6 +111,11 @@ impl RawModel {
         Self {
             mean: model.standardisation().mean.map(|v| v as f32).into(),
             scale: model.standardisation().scale.map(|v| v as f32).into(),
+            bend: model.standardisation().bend.map(|v| v as f32),
+            training: [
+                model.standardisation().ridge as f32,
+                model.standardisation().shrinkage as f32,
+            ],
             covariance: narrow(&calibration.covariance[..knots]),
             straight_m2: narrow(&calibration.straight_m2[..knots]),
             novelty90: calibration.novelty90 as f32,
@@ -160,6 +168,9 @@ impl RawModel {
             Standardisation {
                 mean: SVector::from(self.mean.map(f64::from)),
                 scale: SVector::from(self.scale.map(f64::from)),
+                bend: self.bend.map(f64::from),
+                ridge: f64::from(self.training[0]),
+                shrinkage: f64::from(self.training[1]),
             },
             components,
             calibration,
