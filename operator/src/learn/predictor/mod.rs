@@ -33,6 +33,10 @@ const JOINT: usize = FEATURES + 9;
 /// The knots (from 1) EM sees: 100, 200 and 300 ms.
 const EM_KNOTS: [usize; 3] = [3, 6, 9];
 
+/// A character replaces one before it in the list if it leaves less than this of its squared error: that of a few
+/// demonstrations is no more certain.
+const CLEARLY: f64 = 0.8;
+
 const LLOYD_STEPS: usize = 15;
 
 /// What kind of motion a predictor is fitted to.
@@ -70,8 +74,8 @@ pub struct PredictorOptions {
     pub components: usize,
     /// Knots J of 1/30 s.
     pub knots: usize,
-    /// What the motion may be like: that which foretells the demonstrations held out best, of a single
-    /// demonstration the first. None is [`LearnError::NoCharacter`].
+    /// What the motion may be like: the first, unless a later one foretells the demonstrations held out clearly better.
+    /// None is [`LearnError::NoCharacter`].
     pub characters: Vec<Character>,
     /// Weight of a demonstration's copies at other paces; 0: none.
     pub copies: f64,
@@ -160,7 +164,8 @@ fn train_course<C: Course>(
             progress(Progress::Held { done, of });
         }
         let ratio = trial.ratio();
-        if best.as_ref().is_none_or(|(least, ..)| ratio < *least) {
+        let better = |least: &f64| ratio < CLEARLY * least;
+        if best.as_ref().is_none_or(|(least, ..)| better(least)) {
             best = Some((ratio, *character, trial));
         }
     }

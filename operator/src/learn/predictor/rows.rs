@@ -62,12 +62,13 @@ pub(super) fn with_copies<C: Course>(
 
 /// How many rows a demonstration counts for, its copies included.
 pub(in crate::learn) fn row_count(d: &Demonstration, copies: f64) -> f64 {
-    let count = |pace: f64| {
+    let count = |d: &Demonstration| {
         let mut last_s = f64::NEG_INFINITY;
-        let times = d.samples().iter().map(|s| s.t_s / pace);
+        let times = d.samples().iter().map(|s| s.t_s);
         times.filter(|t_s| kept(*t_s, &mut last_s)).count() as f64
     };
-    count(1.0) + copies * PACES.into_iter().map(count).sum::<f64>()
+    let copied = PACES.map(|pace| count(&d.paced(pace)));
+    count(d) + copies * copied.iter().sum::<f64>()
 }
 
 /// Whether a sample at `t_s` is far enough from the last one kept.
