@@ -2,6 +2,7 @@
 
 mod blocks;
 mod course;
+mod generic;
 mod others;
 mod refine;
 mod rows;
@@ -23,6 +24,7 @@ use super::{LearnError, Progress};
 use crate::demonstration::Demonstration;
 use course::Fitted;
 pub(super) use course::{Course, Places, Turns};
+use generic::Products;
 pub(super) use refine::refine;
 pub(super) use rows::{Row, row_count};
 use rows::{Scaling, rows};
@@ -279,6 +281,7 @@ fn fit<C: Course>(
     if !charts.is_empty() {
         features.mean.fixed_rows_mut::<3>(0).fill(0.0);
     }
+    let generic = Products::of(rows.iter().copied()).solve()?;
     let seen = |k: usize| C::seen(&scaled, charts.get(k), features.scale[0]);
     let weigh = |shares: &mut [f64]| {
         let rows = shares.chunks_exact_mut(stride).zip(&weights);
@@ -296,6 +299,7 @@ fn fit<C: Course>(
         standardisation: features,
         components,
         charts,
+        generic,
     })
 }
 
