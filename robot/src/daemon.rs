@@ -8,12 +8,14 @@ use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::{HostClock, quic};
 use telemime_protocol::skill::Skill;
+use telemime_protocol::wire::Version;
 use telemime_protocol::wire::frame::Frame;
-use telemime_protocol::wire::hello::{Answer, Hello, RejectCode, negotiate};
-use telemime_protocol::wire::v1::{self, Cause, Info, RobotState};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
+use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
+use telemime_protocol::wire::v1::{Cause, Info, RobotState};
+use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep_until};
 
+use crate::door::{self, Door, Place, Verdict};
 use crate::servo::thread::Timing;
 use crate::servo::{Handle, Order, Report};
 use crate::session::{Counters, Output, Session, SessionConfig, TickTiming};
@@ -36,9 +38,6 @@ const MAX_SILENT_DRAINS: u32 = 125;
 
 /// A stop takes a fraction of a second; after this many drains (2 s) the servo itself must be dead.
 const MAX_STOP_DRAINS: u32 = 500;
-
-/// Connections that may be greeting at the same time.
-const MAX_GREETING: usize = 8;
 
 /// What the daemon needs.
 #[derive(Debug)]
@@ -65,6 +64,8 @@ pub enum Notice {
     Connected {
         /// The session's epoch.
         epoch: u32,
+        /// The protocol version both speak.
+        version: Version,
         /// Its address.
         peer: std::net::SocketAddr,
     },
@@ -138,13 +139,13 @@ impl Daemon {
         mut words: mpsc::UnboundedReceiver<Word>,
         notices: mpsc::UnboundedSender<Notice>,
     ) -> Result<(), ServoDead> {
-        let (greeted_tx, mut greeted) = mpsc::channel::<Greeted>(MAX_GREETING);
+        let (greeted_tx, mut greeted) = mpsc::channel::<Greeted>(door::PLACES);
         let mut drain = interval(DRAIN);
         drain.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut active: Option<Active> = None;
         let mut skill: Option<Arc<Skill>> = None;
         let mut epoch = 0;
-        let permits = Arc::new(Semaphore::new(MAX_GREETING));
+        let door = Door::default();
         loop {
             let ended = self.flush(active.as_mut());
             if let Some(why) = ended {
@@ -159,6 +160,8 @@ impl Daemon {
                 Some(word) = words.recv() => match word {
                     Word::Stop => self.servo.brake.stop_here(),
                     Word::Reset => self.order(Order::Reset { operator: active.is_some(), stop: None }),
+                    // What an operator says; a robot's terminal does not know them.
+                    Word::Keep | Word::Refine | Word::Save(_) => {}
                 },
                 _ = drain.tick() => {
                     self.drain(active.as_mut(), &notices);
@@ -177,12 +180,18 @@ impl Daemon {
                     }
                 }
                 incoming = self.endpoint.accept() => match incoming {
-                    Some(incoming) => match permits.clone().try_acquire_owned() {
-                        Ok(permit) => {
-                            tokio::spawn(greet(incoming, permit, greeted_tx.clone(), notices.clone()));
+                    Some(incoming) => {
+                        let from = incoming.remote_address().ip();
+                        match door.knock(from, incoming.remote_address_validated()) {
+                            Verdict::Enter(place) => {
+                                let greeting = greet(incoming, place, greeted_tx.clone(), notices.clone());
+                                tokio::spawn(tokio::time::timeout(door::STAY, greeting));
+                            }
+                            // It may not be asked twice: then it knows a token already.
+                            Verdict::Prove => drop(incoming.retry().map_err(|e| e.into_incoming().refuse())),
+                            Verdict::Refuse => incoming.refuse(),
                         }
-                        Err(_) => incoming.refuse(),
-                    },
+                    }
                     None => break,
                 },
                 Some(next) = greeted.recv() => {
@@ -230,31 +239,33 @@ impl Daemon {
             control,
             hello,
         } = greeted;
-        let refusal = match negotiate(&hello, v1::VERSION, v1::VERSION) {
-            None => Some((
+        let versions = self.config.versions;
+        let agreed = match versions.choose(&hello) {
+            None => Err((
                 RejectCode::Version,
                 format!(
-                    "this robot speaks version {}, you offer {} to {}",
-                    v1::VERSION,
-                    hello.min,
-                    hello.max
+                    "this robot speaks {versions}, you offer {} to {}",
+                    hello.min, hello.max
                 ),
             )),
-            Some(_) if active.is_some() => Some((
+            Some(_) if active.is_some() => Err((
                 RejectCode::Busy,
                 "another operator has authority".to_owned(),
             )),
-            Some(_) => None,
+            Some(version) => Ok(version),
         };
         let peer = connection.remote_address();
-        if let Some((code, text)) = refusal {
-            let why = format!("{peer}: {text}");
-            tokio::spawn(turn_away(connection, control, code, text));
-            return Some(why);
-        }
+        let version = match agreed {
+            Ok(version) => version,
+            Err((code, text)) => {
+                let why = format!("{peer}: {text}");
+                tokio::spawn(turn_away(connection, control, code, text));
+                return Some(why);
+            }
+        };
         *epoch += 1;
         let ack = Answer::Ack {
-            version: v1::VERSION,
+            version: version.number(),
             features: 0,
             epoch: *epoch,
         };
@@ -267,7 +278,8 @@ impl Daemon {
             *epoch,
             skill.clone(),
             self.clock.now(),
-        );
+        )
+        .speaking(version);
         *active = Some(Active {
             session,
             connection,
@@ -276,6 +288,7 @@ impl Daemon {
         });
         let _ = notices.send(Notice::Connected {
             epoch: *epoch,
+            version,
             peer,
         });
         None
@@ -415,7 +428,7 @@ async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<(u32,
 /// Handshake and greeting, beside the running session.
 async fn greet(
     incoming: Incoming,
-    _permit: OwnedSemaphorePermit,
+    _place: Place,
     greeted: mpsc::Sender<Greeted>,
     notices: mpsc::UnboundedSender<Notice>,
 ) {

@@ -8,6 +8,7 @@ pub mod cli;
 pub mod clock;
 pub mod control;
 pub mod daemon;
+pub mod door;
 pub mod rig;
 pub mod safety;
 pub mod servo;

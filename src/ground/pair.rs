@@ -11,7 +11,7 @@ use telemime_endpoint::cli::Word;
 use telemime_endpoint::quic::EndpointError;
 use telemime_endpoint::{HostClock, Identity, IdentityError, Meter, Mono, quic};
 use telemime_operator::daemon::{
-    Daemon as OperatorDaemon, DaemonError, Notice as OperatorNotice, Summary,
+    Daemon as OperatorDaemon, DaemonError, Learning, Notice as OperatorNotice, Summary,
 };
 use telemime_operator::session::SessionConfig;
 use telemime_operator::task::Task;
@@ -20,6 +20,7 @@ use telemime_protocol::time::Stamp;
 use telemime_robot::daemon::{Daemon as RobotDaemon, Notice as RobotNotice};
 use telemime_robot::rig::Rig;
 use telemime_robot::servo::{self, Report};
+use telemime_robot::session::SessionConfig as RobotConfig;
 use telemime_sim::link::LinkConfig;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval};
@@ -72,6 +73,8 @@ pub struct Pair {
     robot_identity: Identity,
     operator_identity: Identity,
     operators: u8,
+    /// What operators started from now on learn from while driving.
+    pub learning: Learning,
 }
 
 /// The robot of a [`Pair`]: what it reports, tick by tick.
@@ -135,6 +138,14 @@ impl Pair {
     /// # Errors
     /// [`PairError`].
     pub fn start(rig: &Rig) -> Result<Self, PairError> {
+        Self::start_with(rig, Default::default())
+    }
+
+    /// As [`Pair::start`], with the sessions set to `config`.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn start_with(rig: &Rig, config: RobotConfig) -> Result<Self, PairError> {
         let network = Network::new();
         let clock = HostClock::from_zero();
         let robot_identity = Identity::ephemeral()?;
@@ -160,14 +171,7 @@ impl Pair {
             socket,
             &Meter::default(),
         )?;
-        let daemon = RobotDaemon::new(
-            endpoint,
-            clock,
-            rig.info(),
-            Default::default(),
-            handle,
-            None,
-        );
+        let daemon = RobotDaemon::new(endpoint, clock, rig.info(), config, handle, None);
         let (quit, quit_rx) = watch::channel(false);
         let (tx, mut rx) = mpsc::unbounded_channel();
         let (words, words_rx) = mpsc::unbounded_channel();
@@ -194,6 +198,7 @@ impl Pair {
             robot_identity,
             operator_identity,
             operators: 0,
+            learning: Learning::default(),
         })
     }
 
@@ -264,6 +269,7 @@ impl Pair {
             skill,
             recogniser: None,
             config,
+            learning: self.learning.clone(),
             patience: Duration::from_secs(5),
         };
         let (quit, quit_rx) = watch::channel(false);

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 13] = [
+const COMMANDS: [&str; 15] = [
     "demo",
     "import",
     "learn",
@@ -13,10 +13,12 @@ const COMMANDS: [&str; 13] = [
     "recognise",
     "confusion",
     "select",
+    "evaluate",
     "codec",
     "robot",
     "operator",
     "link",
+    "tap",
     "paper",
 ];
 

@@ -15,6 +15,9 @@ use super::turn::{WirePose, WireRotation};
 /// The version this module speaks.
 pub const VERSION: u16 = 1;
 
+/// Whether this version is released: from then on its bytes never change, and a test holds `tests/vectors/wire_v1.json` to that.
+pub const RELEASED: bool = false;
+
 /// The ALPN identifier that goes with it; it freezes the framing.
 pub const ALPN: &[u8] = b"telemime/1";
 

@@ -15,7 +15,6 @@ use telemime_endpoint::Mono;
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
-use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::turn::{WireRotation, dequantise_grip, quantise_grip};
@@ -23,6 +22,7 @@ use telemime_protocol::wire::v1::{
     Cause, Drive, Engage, Info, MAX_PLAN_LEN, Message, ModelId, OperatorControl, OperatorDatagram,
     Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
 };
+use telemime_protocol::wire::{DecodeError, Version, Versions};
 
 use crate::clock::{SessionClock, Slew};
 use crate::servo::{Engagement, Lease, Order, Report, Source, Ticket, Trajectory};
@@ -40,6 +40,8 @@ pub struct SessionConfig {
     pub telemetry_s: f64,
     /// A sample that took longer than this to arrive authorises nothing beyond, s.
     pub max_delay_s: f64,
+    /// The protocol versions this robot speaks.
+    pub versions: Versions,
 }
 
 impl Default for SessionConfig {
@@ -47,6 +49,7 @@ impl Default for SessionConfig {
         Self {
             telemetry_s: 0.05,
             max_delay_s: 0.5,
+            versions: Versions::default(),
         }
     }
 }
@@ -96,8 +99,11 @@ pub struct Session {
     config: SessionConfig,
     info: Info,
     epoch: u32,
+    version: Version,
     clock: SessionClock,
     skill: Option<Arc<Skill>>,
+    /// Takes its place at the next engage.
+    next_skill: Option<Arc<Skill>>,
     plan: Option<(u32, PosePlan)>,
     mirror: Option<Mirror>,
     engagement: u32,
@@ -128,8 +134,10 @@ impl Session {
         let mut session = Self {
             config,
             epoch,
+            version: Version::V1,
             clock: SessionClock::default(),
             skill,
+            next_skill: None,
             plan: None,
             mirror: None,
             engagement: 0,
@@ -152,9 +160,16 @@ impl Session {
         session
     }
 
+    /// Speaks `version` instead of version 1.
+    #[must_use]
+    pub fn speaking(mut self, version: Version) -> Self {
+        self.version = version;
+        self
+    }
+
     /// The model held, for the next session.
     pub fn skill(&self) -> Option<Arc<Skill>> {
-        self.skill.clone()
+        self.next_skill.as_ref().or(self.skill.as_ref()).cloned()
     }
 
     /// The clock estimate.
@@ -219,7 +234,7 @@ impl Session {
 
     /// A datagram. Nothing in it can end the session: what is wrong is dropped and counted.
     pub fn handle_datagram(&mut self, now: Mono, bytes: &[u8]) {
-        let taken = match OperatorDatagram::decode(bytes) {
+        let taken = match self.version.decode_operator_datagram(bytes) {
             Ok(OperatorDatagram::Motion(motion)) => self.on_motion(now, &motion),
             Ok(OperatorDatagram::Go {
                 epoch,
@@ -339,11 +354,24 @@ impl Session {
     fn store_model(&mut self, id: ModelId, bytes: &[u8]) {
         match Skill::from_bytes(bytes) {
             Ok(skill) if skill.id().0 == id => {
-                self.skill = Some(Arc::new(skill));
+                // What is being followed goes on with the model it began with: another one would be a jump.
+                let skill = Some(Arc::new(skill));
+                if self.is_following() {
+                    self.next_skill = skill;
+                } else {
+                    (self.skill, self.next_skill) = (skill, None);
+                }
                 self.send(&RobotControl::ModelStored { id });
             }
             _ => self.refuse(Refusal::BadModel),
         }
+    }
+
+    /// Something is followed, or was granted a moment ago.
+    fn is_following(&self) -> bool {
+        let state = self.report.map(|r| r.state);
+        self.acknowledged != self.engagement
+            || matches!(state, Some(RobotState::Engaged | RobotState::Coasting))
     }
 
     fn engage(&mut self, now: Mono, engage: &Engage) -> Result<(), Refusal> {
@@ -362,6 +390,9 @@ impl Session {
         // What was granted a moment ago is not in a report yet.
         if self.acknowledged != self.engagement {
             return Err(Refusal::AlreadyEngaged);
+        }
+        if let Some(next) = self.next_skill.take() {
+            self.skill = Some(next);
         }
         let [w, x, y, z] = engage.rotation.map(f64::from);
         let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
