@@ -258,6 +258,33 @@ impl Demonstration {
         Self::parse(name, csv_text(&[], samples).as_bytes())
     }
 
+    /// The same path in 1/`pace` of the time, sampled evenly at the mean rate of this one; name and hash stay.
+    pub(crate) fn paced(&self, pace: f64) -> Self {
+        let step_s = self.duration_s() / (self.samples.len() - 1) as f64;
+        let steps = (self.duration_s() / (pace * step_s)).floor() as usize;
+        let at = |i: usize| {
+            let t_s = i as f64 * step_s;
+            let own_s = self.samples[0].t_s + t_s * pace;
+            Sample {
+                t_s,
+                position: self.position_at(own_s),
+                orientation: self.orientation_at(own_s),
+                grip: self.grip_at(own_s),
+            }
+        };
+        Self {
+            samples: (0..=steps).map(at).collect(),
+            ..self.clone()
+        }
+    }
+
+    /// The same motion, `by` (m) from here; name, hash and frames stay.
+    pub(crate) fn shifted(&self, by: &Vector3<f64>) -> Self {
+        let mut copy = self.clone();
+        copy.samples.iter_mut().for_each(|s| s.position += by);
+        copy
+    }
+
     /// Whether every sample has an orientation.
     pub fn has_orientation(&self) -> bool {
         self.samples.iter().all(|s| s.orientation.is_some())

@@ -153,6 +153,9 @@ fn skill() -> Skill {
         Standardisation {
             mean: SVector::zeros(),
             scale: SVector::repeat(0.5),
+            bend: [0.125, 0.0],
+            ridge: 0.03125,
+            shrinkage: 8.0,
         },
         vec![
             component(0.75, 0.0, 0.125, 0.25),

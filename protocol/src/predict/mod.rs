@@ -9,16 +9,16 @@ mod experts;
 mod forecast;
 mod model;
 mod params;
+mod standard;
 mod state;
 mod turn;
 
 pub use ahead::{Ahead, Knot, Way};
 pub use experts::{Experts, Generic};
 pub use forecast::{Forecast, Prediction};
-pub use model::{
-    BLOCK, Calibration, Model, ModelError, Posterior, Regression, Standardisation, TARGETS, TEMPER,
-};
+pub use model::{BLOCK, Calibration, Model, ModelError, Posterior, Regression, TARGETS, TEMPER};
 pub use params::{BAND_KNOTS, Params, ParamsError, WEIGHTED};
+pub use standard::{BENT, Standardisation};
 pub use state::{FEATURES, HandState, MEMORY_TAU_S};
 pub use turn::{TurnForecast, TurnModel, TurnPrediction, TurnState, checksum};
 
