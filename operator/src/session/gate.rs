@@ -20,7 +20,7 @@ const SENSOR_M: f64 = 0.01;
 const SENSOR_RAD: f64 = 0.1;
 
 /// Nor is what the demonstrated speed (95 % of the time not exceeded) covers this many times between two samples: a hand may begin, or turn back.
-const SPEED: f64 = 2.5;
+const SPEED: f64 = 1.5;
 
 /// The speed of a hand of which nothing was demonstrated, m/s: 95 % of a wave's are below.
 const UNKNOWN_M_S: f64 = 4.0;
