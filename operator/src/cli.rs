@@ -91,9 +91,10 @@ pub struct Args {
     /// How old a sample is when the input hands it over, 0 to 300ms: `telemime tap` measures it [default: 0ms].
     #[arg(long, value_name = "TIME", value_parser = parse_latency)]
     pub input_latency: Option<f64>,
-    /// Take every sample as it comes: no sample is replaced that a tracker got wrong for a frame or two.
+    /// For a tracker that takes something else for the hand now and then: replace one or two samples running that the
+    /// predictor all but rules out. A hand that jumps farther than it ever did is believed two samples later.
     #[arg(long)]
-    pub no_glitch_gate: bool,
+    pub glitch_gate: bool,
     /// Prediction gain, 0 (none) to 1.
     #[arg(long)]
     pub gain: Option<f64>,
@@ -305,7 +306,7 @@ impl Args {
                 .map_err(|e| anyhow::anyhow!("{}: [input] latency_ms = {e}", path.display()))?;
             self.input_latency = Some(latency);
         }
-        self.no_glitch_gate |= file.input.glitch_gate == Some(false);
+        self.glitch_gate |= file.input.glitch_gate.unwrap_or(false);
         if self.frame.is_empty() && self.play.is_some() {
             self.frame = file
                 .frames
@@ -340,7 +341,7 @@ impl Args {
             future_bound: self.future_bound.unwrap_or(defaults.future_bound),
             path_bound_m: self.path_bound,
             input_latency_s: self.input_latency.unwrap_or(0.0),
-            glitch_gate: !self.no_glitch_gate,
+            glitch_gate: self.glitch_gate,
             gain: self.gain.unwrap_or(defaults.gain),
             scale: self.scale,
             rotation: self.axes.unwrap_or_default().rotation(),

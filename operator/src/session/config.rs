@@ -30,7 +30,8 @@ pub struct SessionConfig {
     pub path_bound_m: Option<f64>,
     /// The input's own latency, s: how long after it was valid a sample is handed over. It is subtracted from the sample's time.
     pub input_latency_s: f64,
-    /// What a tracker gets wrong for a frame or two is replaced by its prediction.
+    /// What a tracker gets wrong for a frame or two is replaced by its prediction. For trackers that do: a hand that
+    /// jumps farther than it ever did is believed two samples later.
     pub glitch_gate: bool,
     /// Prediction gain κ in [0, 1].
     pub gain: f64,
@@ -51,7 +52,7 @@ impl Default for SessionConfig {
             future_bound: FutureBound::Relative(0.6),
             path_bound_m: None,
             input_latency_s: 0.0,
-            glitch_gate: true,
+            glitch_gate: false,
             gain: 1.0,
             scale: None,
             rotation: UnitQuaternion::identity(),

@@ -84,12 +84,7 @@ fn every_refusal_but_a_divergence_ends_the_attempt() {
 
 #[test]
 fn what_a_declined_request_took_is_not_counted() {
-    // A hand that is in two places at once.
-    let config = SessionConfig {
-        glitch_gate: false,
-        ..SessionConfig::default()
-    };
-    let mut bench = Bench::ready(config, None);
+    let mut bench = Bench::ready(SessionConfig::default(), None);
     bench.sample(home());
     for reason in [Refusal::ClockUnknown, Refusal::Moving] {
         bench.session.engage(bench.now);
