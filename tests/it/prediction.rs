@@ -308,8 +308,14 @@ const GESTURES: [(&str, [[f64; 3]; 2]); 5] = [
     ("utd_mhad/a03_wave", [[0.388, 0.360, 0.348], [9.0; 3]]),
     ("utd_mhad/a01_swipe_left", [[0.380, 0.322, 0.284], [9.0; 3]]),
     ("utd_mhad/a09_circle_cw", [[0.322, 0.307, 0.288], [9.0; 3]]),
-    ("utd_mhad/a15_tennis_swing", [[0.415, 0.388, 0.370], [9.0; 3]]),
-    ("kard/a01_horizontal_arm_wave", [[0.508, 0.485, 0.507], [9.0; 3]]),
+    (
+        "utd_mhad/a15_tennis_swing",
+        [[0.415, 0.388, 0.370], [9.0; 3]],
+    ),
+    (
+        "kard/a01_horizontal_arm_wave",
+        [[0.508, 0.485, 0.507], [9.0; 3]],
+    ),
 ];
 
 /// What other people's demonstrations are worth where there are two own ones.

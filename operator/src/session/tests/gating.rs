@@ -99,7 +99,9 @@ fn a_wrist_that_flips_for_a_frame_does_not_turn_the_tool() {
         let motions = bench.motions();
         motions.last().unwrap().pose.turn.unwrap()
     };
-    (0..20).for_each(|i| drop(sample(&mut bench, i, 0.01 * f64::from(i))));
+    for i in 0..20 {
+        sample(&mut bench, i, 0.01 * f64::from(i));
+    }
     sample(&mut bench, 20, 3.0);
     let told = sample(&mut bench, 21, 0.21).dequantise(Stamp::ZERO);
     assert!(
