@@ -6,8 +6,9 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
-use telemime_endpoint::HostClock;
 use telemime_endpoint::cli::{self as shell, one_line};
+use telemime_endpoint::peers::Role;
+use telemime_endpoint::{HostClock, admin};
 use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
 
 use crate::relay::{Passage, Relay, RelayConfig};
@@ -50,6 +51,12 @@ enum Command {
     Operator(Box<telemime_operator::cli::Args>),
     /// The robot daemon: an arm that follows.
     Robot(telemime_robot::cli::Args),
+    /// Show this host's key by its fingerprint; make it if there is none.
+    Identity(admin::IdentityArgs),
+    /// Pair with a robot that has a pairing window open.
+    Pair(telemime_operator::cli::PairArgs),
+    /// List whom this host trusts; add, revoke, remove.
+    Peers(admin::PeersArgs),
     /// A UDP relay that delays, loses and throttles what passes.
     Link(LinkArgs),
     /// Reproduce the tables of the source publication beside ours.
@@ -120,6 +127,9 @@ pub fn main() -> ExitCode {
         Some(Command::Codec(args)) => codec::run(args),
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),
+        Some(Command::Identity(args)) => admin::identity(args, Role::Operator),
+        Some(Command::Pair(args)) => telemime_operator::cli::pair(args),
+        Some(Command::Peers(args)) => admin::peers(args),
         Some(Command::Link(args)) => link(args),
         Some(Command::Paper(args)) => paper::run(args),
     };
@@ -147,7 +157,7 @@ fn link(args: &LinkArgs) -> anyhow::Result<()> {
         .build()?;
     let (mut passed, mut lost) = (0u64, 0u64);
     let result = runtime.block_on(async {
-        let (quit, _words) = shell::listen(false, || {})?;
+        let (quit, _words) = shell::listen(false, "quit?", || {})?;
         let config = RelayConfig {
             listen: args.listen,
             to: args.to,

@@ -8,34 +8,28 @@ use std::time::Duration;
 
 use quinn::{Connection, Endpoint, VarInt};
 use telemime_endpoint::cli::{Word, told};
-use telemime_endpoint::control::{Control, ControlError, Writer};
+use telemime_endpoint::control::ControlError;
 use telemime_endpoint::meter::Counts;
-use telemime_endpoint::{HostClock, Meter, Mono, quic};
+use telemime_endpoint::{Fingerprint, HostClock, Meter, Mono, Standing, Trust, quic, trust};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::DecodeError;
-use telemime_protocol::wire::frame::Frame;
-use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
-use telemime_protocol::wire::v1;
+use telemime_protocol::wire::hello::RejectCode;
 use tokio::sync::{mpsc, watch};
-use tokio::time::{sleep_until, timeout};
+use tokio::time::sleep_until;
 
+use crate::dial::{DialError, Dialler, Link};
 use crate::recognise::Recogniser;
 use crate::session::{Counters, Event, Output, Session, SessionConfig};
 use crate::task::{Advice, Outcome, Task};
 
-/// The first attempt to connect is given this long; later ones twice as long each.
-const FIRST_ATTEMPT: Duration = Duration::from_secs(1);
-const LONGEST_ATTEMPT: Duration = Duration::from_secs(10);
-
-/// Pause between attempts.
-const REDIAL_S: f64 = 0.25;
-
 /// What the daemon needs.
 #[derive(Debug)]
 pub struct Daemon {
-    /// A client endpoint whose default settings pin the robot's key.
+    /// A client endpoint whose default settings trust whom `trust` does.
     pub endpoint: Endpoint,
+    /// The robot's key, and whether it still is trusted.
+    pub trust: Trust,
     /// Counts the endpoint's traffic.
     pub meter: Meter,
     /// The robot.
@@ -74,6 +68,26 @@ pub enum DaemonError {
         code: RejectCode,
         /// Why, for people.
         text: String,
+    },
+    /// Another key answers than the one that is pinned.
+    #[error(
+        "the robot at {addr} has another key than the one we know: it shows {}. Either it was set up anew, or somebody \
+         is in between; nothing was sent. If it was on purpose, run `telemime peers remove` for the old key and pair again",
+        shown.map_or_else(|| "none we can read".to_owned(), |key| key.to_string())
+    )]
+    KeyChanged {
+        /// Its address.
+        addr: SocketAddr,
+        /// What it shows.
+        shown: Option<Fingerprint>,
+    },
+    /// The robot has revoked our key.
+    #[error(
+        "the robot at {addr} has revoked our key: it must be removed there (`telemime peers remove`) before it can be paired again"
+    )]
+    Revoked {
+        /// Its address.
+        addr: SocketAddr,
     },
 }
 
@@ -127,12 +141,8 @@ pub enum Notice {
     },
 }
 
-struct Link {
-    connection: Connection,
-    writer: Writer,
-    frames: mpsc::Receiver<Result<Frame, ControlError>>,
-    epoch: u32,
-}
+const NOT_HERE: &str =
+    "an operator is paired by `telemime pair HOST:PORT`, a robot on its own terminal";
 
 /// What the person at the terminal says.
 struct Console<'a> {
@@ -154,6 +164,7 @@ impl Console<'_> {
                         "there is no link: the emergency stop is the first thing the robot will hear"
                     }
                     Word::Reset => "there is no link: the reset is discarded",
+                    Word::Pair(_) | Word::Yes | Word::No => NOT_HERE,
                 }),
                 done = &mut work => return done,
             }
@@ -163,11 +174,6 @@ impl Console<'_> {
     fn note(&self, text: &'static str) {
         let _ = self.notices.send(Notice::Note(text));
     }
-}
-
-enum DialError {
-    Again(String),
-    Rejected { code: RejectCode, text: String },
 }
 
 enum End {
@@ -198,6 +204,7 @@ impl Daemon {
         let mut marks = Marks::default();
         // Demanded, and not confirmed by the robot: outlives the session it was demanded in.
         let mut stop = false;
+        let mut rtt = None;
         loop {
             let mut hung_up = quit.clone();
             let mut console = Console {
@@ -208,9 +215,10 @@ impl Daemon {
             let link = tokio::select! {
                 biased;
                 () = told(&mut hung_up) => break,
-                link = self.dial(summary.sessions == 0, task, &mut console, &mut stop) => link?,
+                link = self.dial(rtt, task, &mut console, &mut stop) => link?,
             };
             let Some(link) = link else { break };
+            let connection = link.connection.clone();
             summary.sessions += 1;
             let _ = notices.send(Notice::Connected { epoch: link.epoch });
             let mut session = Session::new(self.config, self.skill.clone(), link.epoch)
@@ -222,6 +230,8 @@ impl Daemon {
             let end = self
                 .drive(&mut session, link, task, console, &mut marks)
                 .await;
+            rtt = Some(connection.rtt());
+            drop(connection);
             stop = session.stop_is_unconfirmed();
             summary.counters.add(session.counters());
             match end {
@@ -254,86 +264,56 @@ impl Daemon {
     }
 
     /// Dials until there is a session; `None` once the task is over anyway and no `stop` has to be delivered.
+    /// `rtt` is the last session's round trip, if there was one.
     async fn dial(
         &self,
-        first: bool,
+        rtt: Option<Duration>,
         task: &Task,
         console: &mut Console<'_>,
         stop: &mut bool,
     ) -> Result<Option<Link>, DaemonError> {
-        let begun = self.now();
-        let mut attempt = FIRST_ATTEMPT;
+        let (begun, first, addr) = (self.now(), rtt.is_none(), self.robot);
+        let mut dialler = Dialler::new(&self.endpoint, addr, rtt);
+        let mut said = None;
         loop {
-            let dialled = console.beside(stop, timeout(attempt, self.connect())).await;
-            attempt = (attempt * 2).min(LONGEST_ATTEMPT);
+            let outcome = console.beside(stop, dialler.next()).await;
             let patient = self.now().secs_since(begun) <= self.patience.as_secs_f64();
-            let why = match dialled {
-                Ok(Ok(link)) => return Ok(Some(link)),
+            let why = match outcome {
+                Some(Ok(link)) => return Ok(Some(link)),
+                None => None,
+                Some(Err(DialError::Again(why))) => Some(why),
                 // An operator that lost its link, or comes back, may find its own old session still in authority.
-                Ok(Err(DialError::Rejected {
+                Some(Err(DialError::Rejected {
                     code: RejectCode::Busy,
                     text,
-                })) if !first || patient => text,
-                Ok(Err(DialError::Rejected { code, text })) => {
-                    return Err(DaemonError::Rejected {
-                        addr: self.robot,
-                        code,
-                        text,
-                    });
+                })) if !first || patient => Some(text),
+                Some(Err(DialError::Rejected { code, text })) => {
+                    return Err(DaemonError::Rejected { addr, code, text });
                 }
-                Ok(Err(DialError::Again(why))) => why,
-                Err(_) => "no answer: is the robot running, and does UDP reach it?".to_owned(),
+                Some(Err(DialError::KeyChanged)) => {
+                    let shown = self.trust.turned_away();
+                    let changed = DaemonError::KeyChanged { addr, shown };
+                    if first {
+                        return Err(changed);
+                    }
+                    // Whoever answers in its place now need not be there for long.
+                    Some(changed.to_string())
+                }
+                Some(Err(DialError::Revoked)) => return Err(DaemonError::Revoked { addr }),
             };
             if first && !patient {
-                return Err(DaemonError::Unreachable {
-                    addr: self.robot,
-                    why,
-                });
+                let why = why.or(said);
+                let why = why.unwrap_or_else(|| "no answer".into());
+                return Err(DaemonError::Unreachable { addr, why });
             }
             if task.is_over(self.now()) && !*stop {
                 return Ok(None);
             }
-            let _ = console.notices.send(Notice::Dialling { why });
-            let again = self.instant(self.now().offset_by_secs(REDIAL_S));
-            console.beside(stop, sleep_until(again)).await;
-        }
-    }
-
-    async fn connect(&self) -> Result<Link, DialError> {
-        let again = |e: ControlError| DialError::Again(e.to_string());
-        let connecting = self
-            .endpoint
-            .connect(self.robot, "telemime")
-            .map_err(|e| DialError::Again(e.to_string()))?;
-        let connection = connecting
-            .await
-            .map_err(|e| DialError::Again(quic::explain(&e)))?;
-        let mut control = Control::open(&connection).await.map_err(again)?;
-        let hello = Hello {
-            min: v1::VERSION,
-            max: v1::VERSION,
-            features: 0,
-        };
-        control.write(&hello.encode()).await.map_err(again)?;
-        match control.answer().await.map_err(again)? {
-            Answer::Ack {
-                version: v1::VERSION,
-                epoch,
-                ..
-            } => {
-                let (writer, frames) = control.into_frames();
-                Ok(Link {
-                    connection,
-                    writer,
-                    frames,
-                    epoch,
-                })
+            if why.is_some() && why != said {
+                said.clone_from(&why);
+                let why = why.unwrap_or_default();
+                let _ = console.notices.send(Notice::Dialling { why });
             }
-            Answer::Ack { version, .. } => Err(DialError::Rejected {
-                code: RejectCode::Version,
-                text: format!("it answers with version {version}, which we did not offer"),
-            }),
-            Answer::Reject { code, text } => Err(DialError::Rejected { code, text }),
         }
     }
 
@@ -346,6 +326,7 @@ impl Daemon {
         marks: &mut Marks,
     ) -> End {
         let notices = console.notices;
+        let key = trust::key_of(&link.connection);
         loop {
             if let Err(e) = self.flush(session, &link, marks) {
                 return End::Lost(e.to_string());
@@ -393,10 +374,18 @@ impl Daemon {
                     let _ = self.leave(session, link, marks).await;
                     return End::Quit;
                 }
+                standing = self.withdrawn(key) => {
+                    let _ = self.leave(session, link, marks).await;
+                    return End::Lost(match standing {
+                        Standing::Revoked => "the robot's key was revoked".into(),
+                        Standing::Trusted | Standing::Unknown => "the robot's key is not trusted any more".into(),
+                    });
+                }
                 Some(word) = console.words.recv() => match word {
                     Word::Stop => session.stop(self.now()),
                     Word::Reset if session.reset() => {}
                     Word::Reset => console.note("the reset is discarded: the robot has not confirmed the stop yet"),
+                    Word::Pair(_) | Word::Yes | Word::No => console.note(NOT_HERE),
                 },
                 frame = link.frames.recv() => match frame {
                     Some(Ok(frame)) => {
@@ -416,6 +405,14 @@ impl Daemon {
                     session.handle_timeout(now);
                 }
             }
+        }
+    }
+
+    /// Resolves once the robot's key is not trusted any more.
+    async fn withdrawn(&self, key: Option<Fingerprint>) -> Standing {
+        match key {
+            Some(key) => self.trust.withdrawn(key).await,
+            None => Standing::Unknown,
         }
     }
 

@@ -6,14 +6,17 @@ use std::time::Duration;
 use quinn::{Connection, Endpoint, Incoming, VarInt};
 use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{Control, ControlError, Writer};
-use telemime_endpoint::{HostClock, quic};
+use telemime_endpoint::{Fingerprint, HostClock, Mono, Standing, Trust, quic, trust};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode, negotiate};
+use telemime_protocol::wire::pair;
 use telemime_protocol::wire::v1::{self, Cause, Info, RobotState};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep_until};
 
+use crate::desk::{Desk, Progress};
+use crate::refused::{Reason, Refused, Tally};
 use crate::servo::thread::Timing;
 use crate::servo::{Handle, Order, Report};
 use crate::session::{Counters, Output, Session, SessionConfig, TickTiming};
@@ -27,6 +30,7 @@ const MALFORMED: u32 = 1;
 const REJECTED: u32 = 2;
 const BAD_GREETING: u32 = 3;
 const FAULT: u32 = 4;
+const NOT_TRUSTED: u32 = 5;
 
 /// What is still to be said when a session ends gets this long.
 const LAST_WORDS: Duration = Duration::from_millis(500);
@@ -39,6 +43,10 @@ const MAX_STOP_DRAINS: u32 = 500;
 
 /// Connections that may be greeting at the same time.
 const MAX_GREETING: usize = 8;
+
+/// An operator that comes back takes its own old session's place once that has been silent for two keep-alives:
+/// its connection is dead, and only its time-out does not know yet.
+const HALF_OPEN_S: f64 = 2.0 * quic::KEEP_ALIVE.as_millis() as f64 * 1e-3;
 
 /// What the daemon needs.
 #[derive(Debug)]
@@ -55,6 +63,9 @@ pub struct Daemon {
     servo: Handle,
     /// The servo's timing, where it has a thread of its own.
     timing: Option<Arc<Timing>>,
+    /// Whom it trusts, and how that grows.
+    desk: Desk,
+    refused: Tally,
     silent_drains: u32,
 }
 
@@ -77,11 +88,10 @@ pub enum Notice {
         /// What the session counted.
         counters: Counters,
     },
-    /// Somebody was turned away.
-    Refused {
-        /// Why.
-        why: String,
-    },
+    /// Somebody was turned away: told the first time, and then ever more rarely.
+    Refused(Refused),
+    /// A pairing makes progress.
+    Pairing(Progress),
     /// A servo tick, for recording.
     Report(Box<Report>),
     /// The path an engagement received, as it stands when the session ends: time (s, session clock), m, m/s, and
@@ -91,13 +101,26 @@ pub enum Notice {
 
 struct Greeted {
     connection: Connection,
+    key: Fingerprint,
     control: Control,
     hello: Hello,
+}
+
+/// What became of a connection that somebody opened.
+enum Arrival {
+    Greeted(Box<Greeted>),
+    /// It wants to be paired.
+    Pairing(Connection),
+    /// Turned away already.
+    Refused(std::net::SocketAddr, Reason, String),
 }
 
 struct Active {
     session: Session,
     connection: Connection,
+    key: Fingerprint,
+    /// Packets received, and when that last changed.
+    heard: (u64, Mono),
     writer: Writer,
     frames: mpsc::Receiver<Result<Frame, ControlError>>,
 }
@@ -109,6 +132,7 @@ pub struct ServoDead;
 
 impl Daemon {
     /// A daemon that serves `endpoint` and drives `servo`, whose timing is `timing` if it has a thread of its own.
+    /// The endpoint trusts whom the `desk` trusts.
     pub fn new(
         endpoint: Endpoint,
         clock: HostClock,
@@ -116,6 +140,7 @@ impl Daemon {
         config: SessionConfig,
         servo: Handle,
         timing: Option<Arc<Timing>>,
+        desk: Desk,
     ) -> Self {
         Self {
             endpoint,
@@ -124,6 +149,8 @@ impl Daemon {
             config,
             servo,
             timing,
+            desk,
+            refused: Tally::default(),
             silent_drains: 0,
         }
     }
@@ -138,9 +165,10 @@ impl Daemon {
         mut words: mpsc::UnboundedReceiver<Word>,
         notices: mpsc::UnboundedSender<Notice>,
     ) -> Result<(), ServoDead> {
-        let (greeted_tx, mut greeted) = mpsc::channel::<Greeted>(MAX_GREETING);
+        let (arrivals_tx, mut arrivals) = mpsc::channel::<Arrival>(MAX_GREETING);
         let mut drain = interval(DRAIN);
         drain.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let trust = self.desk.trust().clone();
         let mut active: Option<Active> = None;
         let mut skill: Option<Arc<Skill>> = None;
         let mut epoch = 0;
@@ -159,6 +187,13 @@ impl Daemon {
                 Some(word) = words.recv() => match word {
                     Word::Stop => self.servo.brake.stop_here(),
                     Word::Reset => self.order(Order::Reset { operator: active.is_some(), stop: None }),
+                    Word::Pair(span) => {
+                        let _ = notices.send(Notice::Pairing(self.desk.open(span)));
+                    }
+                    Word::Yes | Word::No => {
+                        let told = self.desk.word(word == Word::Yes).map(Notice::Pairing);
+                        told.map(|notice| notices.send(notice));
+                    }
                 },
                 _ = drain.tick() => {
                     self.drain(active.as_mut(), &notices);
@@ -168,7 +203,7 @@ impl Daemon {
                         return Err(ServoDead);
                     }
                 }
-                why = receive(active.as_mut(), &self.clock) => if let Some(why) = why {
+                why = receive(active.as_mut(), &self.clock, &trust) => if let Some(why) = why {
                     self.end(&mut active, &mut skill, (why.0, &why.1), &notices);
                 },
                 () = sleep_until(due.unwrap_or_else(tokio::time::Instant::now)), if due.is_some() => {
@@ -179,16 +214,27 @@ impl Daemon {
                 incoming = self.endpoint.accept() => match incoming {
                     Some(incoming) => match permits.clone().try_acquire_owned() {
                         Ok(permit) => {
-                            tokio::spawn(greet(incoming, permit, greeted_tx.clone(), notices.clone()));
+                            tokio::spawn(arrive(incoming, permit, trust.clone(), arrivals_tx.clone()));
                         }
                         Err(_) => incoming.refuse(),
                     },
                     None => break,
                 },
-                Some(next) = greeted.recv() => {
-                    if let Some(why) = self.admit(next, &mut active, &skill, &mut epoch, &notices) {
-                        let _ = notices.send(Notice::Refused { why });
-                    }
+                progress = self.desk.next() => {
+                    let _ = notices.send(Notice::Pairing(progress));
+                }
+                Some(arrival) = arrivals.recv() => {
+                    let refused = match arrival {
+                        Arrival::Greeted(next) => self.admit(*next, &mut active, &mut skill, &mut epoch, &notices),
+                        Arrival::Pairing(connection) => {
+                            let peer = connection.remote_address();
+                            let taken = self.desk.receive(connection);
+                            (!taken).then(|| (peer, Reason::NoWindow, "no pairing window is open for it".to_owned()))
+                        }
+                        Arrival::Refused(peer, reason, why) => Some((peer, reason, why)),
+                    };
+                    let told = refused.and_then(|(peer, reason, why)| self.refused.count(peer, reason, why));
+                    told.map(|refused| notices.send(Notice::Refused(refused)));
                 }
             }
         }
@@ -221,18 +267,29 @@ impl Daemon {
         &mut self,
         greeted: Greeted,
         active: &mut Option<Active>,
-        skill: &Option<Arc<Skill>>,
+        skill: &mut Option<Arc<Skill>>,
         epoch: &mut u32,
         notices: &mpsc::UnboundedSender<Notice>,
-    ) -> Option<String> {
+    ) -> Option<(std::net::SocketAddr, Reason, String)> {
         let Greeted {
             connection,
+            key,
             control,
             hello,
         } = greeted;
+        let now = self.clock.now();
+        let half_open = active.as_mut().is_some_and(|held| {
+            held.listen(now);
+            held.key == key && now.secs_since(held.heard.1) >= HALF_OPEN_S
+        });
+        if half_open {
+            let why = (CLOSED, "its operator has come back");
+            self.end(active, skill, why, notices);
+        }
         let refusal = match negotiate(&hello, v1::VERSION, v1::VERSION) {
             None => Some((
                 RejectCode::Version,
+                Reason::Version,
                 format!(
                     "this robot speaks version {}, you offer {} to {}",
                     v1::VERSION,
@@ -242,15 +299,16 @@ impl Daemon {
             )),
             Some(_) if active.is_some() => Some((
                 RejectCode::Busy,
+                Reason::Busy,
                 "another operator has authority".to_owned(),
             )),
             Some(_) => None,
         };
         let peer = connection.remote_address();
-        if let Some((code, text)) = refusal {
-            let why = format!("{peer}: {text}");
+        if let Some((code, reason, text)) = refusal {
+            let refused = (peer, reason, text.clone());
             tokio::spawn(turn_away(connection, control, code, text));
-            return Some(why);
+            return Some(refused);
         }
         *epoch += 1;
         let ack = Answer::Ack {
@@ -261,16 +319,12 @@ impl Daemon {
         let (writer, frames) = control.into_frames();
         // The first of an empty queue.
         let _ = writer.raw(ack.encode());
-        let session = Session::new(
-            self.config,
-            self.info.clone(),
-            *epoch,
-            skill.clone(),
-            self.clock.now(),
-        );
+        let session = Session::new(self.config, self.info.clone(), *epoch, skill.clone(), now);
         *active = Some(Active {
             session,
             connection,
+            key,
+            heard: (0, now),
             writer,
             frames,
         });
@@ -296,6 +350,9 @@ impl Daemon {
     ) -> bool {
         let mut at_rest = false;
         self.silent_drains += 1;
+        if let Some(active) = active.as_deref_mut() {
+            active.listen(self.clock.now());
+        }
         let timing = self
             .timing
             .as_deref()
@@ -389,12 +446,17 @@ impl Daemon {
 }
 
 /// The next thing the operator sends; a reason if it is the last. Never resolves without an operator.
-async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<(u32, String)> {
+async fn receive(
+    active: Option<&mut Active>,
+    clock: &HostClock,
+    trust: &Trust,
+) -> Option<(u32, String)> {
     let Some(active) = active else {
         return std::future::pending().await;
     };
     tokio::select! {
         biased;
+        standing = trust.withdrawn(active.key) => Some((NOT_TRUSTED, distrust(standing).1.to_owned())),
         frame = active.frames.recv() => match frame {
             Some(Ok(frame)) => {
                 active.session.handle_control(clock.now(), &frame).err().map(|e| (MALFORMED, format!("control message: {e}")))
@@ -412,42 +474,73 @@ async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<(u32,
     }
 }
 
+/// What a key that is not trusted is turned away with.
+fn distrust(standing: Standing) -> (Reason, &'static str) {
+    match standing {
+        Standing::Revoked => (Reason::RevokedKey, "the operator's key was revoked"),
+        Standing::Trusted | Standing::Unknown => {
+            (Reason::UnknownKey, "the operator's key is not pinned here")
+        }
+    }
+}
+
+impl Active {
+    fn listen(&mut self, now: Mono) {
+        let received = self.connection.stats().udp_rx.datagrams;
+        if received != self.heard.0 {
+            self.heard = (received, now);
+        }
+    }
+}
+
 /// Handshake and greeting, beside the running session.
-async fn greet(
+async fn arrive(
     incoming: Incoming,
     _permit: OwnedSemaphorePermit,
-    greeted: mpsc::Sender<Greeted>,
-    notices: mpsc::UnboundedSender<Notice>,
+    trust: Trust,
+    arrivals: mpsc::Sender<Arrival>,
 ) {
     let peer = incoming.remote_address();
-    let refused = |why: String| {
-        let _ = notices.send(Notice::Refused {
-            why: format!("{peer}: {why}"),
-        });
+    let arrival = greet(incoming, &trust).await;
+    let arrival = arrival.unwrap_or_else(|(reason, why)| Arrival::Refused(peer, reason, why));
+    // The daemon has stopped if nobody receives.
+    let _ = arrivals.send(arrival).await;
+}
+
+async fn greet(incoming: Incoming, trust: &Trust) -> Result<Arrival, (Reason, String)> {
+    let connection = incoming.await.map_err(|e| {
+        let reason = match quic::refusal(&e) {
+            Some(quic::Refusal::KeyUnknown) => Reason::UnknownKey,
+            Some(quic::Refusal::KeyRevoked) => Reason::RevokedKey,
+            Some(quic::Refusal::Version) => Reason::Version,
+            _ => Reason::Handshake,
+        };
+        (reason, quic::explain(&e))
+    })?;
+    if quic::alpn(&connection).as_deref() == Some(pair::ALPN) {
+        return Ok(Arrival::Pairing(connection));
+    }
+    // While a pairing window is open TLS lets unknown keys pass.
+    let key = trust::key_of(&connection);
+    let standing = key.map_or(Standing::Unknown, |key| trust.standing(key));
+    let Some(key) = key.filter(|_| standing == Standing::Trusted) else {
+        let (reason, why) = distrust(standing);
+        connection.close(VarInt::from_u32(NOT_TRUSTED), why.as_bytes());
+        return Err((reason, why.to_owned()));
     };
-    let connection = match incoming.await {
-        Ok(connection) => connection,
-        Err(e) => return refused(quic::explain(&e)),
-    };
-    let mut control = match Control::accept(&connection).await {
-        Ok(control) => control,
-        Err(e) => return refused(e.to_string()),
-    };
+    let ungreeted = |e: ControlError| (Reason::Greeting, e.to_string());
+    let mut control = Control::accept(&connection).await.map_err(ungreeted)?;
     match control.hello().await {
-        Ok(hello) => {
-            // The daemon has stopped if nobody receives.
-            let _ = greeted
-                .send(Greeted {
-                    connection,
-                    control,
-                    hello,
-                })
-                .await;
-        }
+        Ok(hello) => Ok(Arrival::Greeted(Box::new(Greeted {
+            connection,
+            key,
+            control,
+            hello,
+        }))),
         Err(e) => {
             let text = e.to_string();
             turn_away(connection, control, RejectCode::Malformed, text.clone()).await;
-            refused(text);
+            Err((Reason::Greeting, text))
         }
     }
 }

@@ -8,6 +8,8 @@ pub mod cli;
 pub mod clock;
 pub mod control;
 pub mod daemon;
+pub mod desk;
+pub mod refused;
 pub mod rig;
 pub mod safety;
 pub mod servo;

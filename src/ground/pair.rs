@@ -8,8 +8,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use telemime_endpoint::cli::Word;
+use telemime_endpoint::pairing::Own;
+use telemime_endpoint::peers::Name;
 use telemime_endpoint::quic::EndpointError;
-use telemime_endpoint::{HostClock, Identity, IdentityError, Meter, Mono, quic};
+use telemime_endpoint::{
+    Fingerprint, HostClock, Identity, IdentityError, Meter, Mono, Trust, quic,
+};
 use telemime_operator::daemon::{
     Daemon as OperatorDaemon, DaemonError, Notice as OperatorNotice, Summary,
 };
@@ -18,6 +22,7 @@ use telemime_operator::task::Task;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_robot::daemon::{Daemon as RobotDaemon, Notice as RobotNotice};
+use telemime_robot::desk::Desk;
 use telemime_robot::rig::Rig;
 use telemime_robot::servo::{self, Report};
 use telemime_sim::link::LinkConfig;
@@ -68,6 +73,8 @@ pub struct Pair {
     pub network: Network,
     /// The robot.
     pub robot: Robot,
+    /// Whom the robot trusts.
+    pub trust: Trust,
     clock: HostClock,
     robot_identity: Identity,
     operator_identity: Identity,
@@ -81,6 +88,7 @@ pub struct Robot {
     notices: Rc<RefCell<Vec<RobotNotice>>>,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
+    tasks: Rc<[tokio::task::AbortHandle; 2]>,
 }
 
 /// An operator of a [`Pair`], running.
@@ -89,11 +97,73 @@ pub struct Operator {
     pub done: tokio::task::JoinHandle<(Result<Summary, DaemonError>, Task)>,
     /// What it notices.
     pub notices: mpsc::UnboundedReceiver<OperatorNotice>,
+    /// Its address.
+    pub addr: SocketAddr,
+    endpoint: quinn::Endpoint,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
 }
 
 impl Robot {
+    fn start(
+        network: &Network,
+        clock: HostClock,
+        rig: &Rig,
+        identity: &Identity,
+        trust: &Trust,
+    ) -> Result<Self, PairError> {
+        let (rings, handle) = servo::rings();
+        let mut core = rig.servo(rings);
+        let period = Duration::from_secs_f64(core.tick_s());
+        let servo = tokio::task::spawn_local(async move {
+            let mut tick = interval(period);
+            tick.set_missed_tick_behavior(MissedTickBehavior::Burst);
+            loop {
+                tick.tick().await;
+                core.tick(clock.now());
+            }
+        });
+        let socket = quic::Socket::Abstract {
+            socket: network.socket(host(1)),
+            seed: [1; 32],
+        };
+        let endpoint = quic::server(identity, trust, socket, &Meter::default())?;
+        let own = Own {
+            name: Name::made_of("virtual-robot"),
+            key: identity.fingerprint(),
+        };
+        let desk = Desk::new(own, trust.clone(), None);
+        let config = Default::default();
+        let daemon = RobotDaemon::new(endpoint, clock, rig.info(), config, handle, None, desk);
+        let (quit, quit_rx) = watch::channel(false);
+        let (tx, mut rx) = mpsc::unbounded_channel();
+        let (words, words_rx) = mpsc::unbounded_channel();
+        let serving = tokio::task::spawn_local(daemon.run(quit_rx, words_rx, tx));
+        let robot = Self {
+            reports: Rc::default(),
+            notices: Rc::default(),
+            quit,
+            words,
+            tasks: Rc::new([servo.abort_handle(), serving.abort_handle()]),
+        };
+        let log = robot.clone();
+        tokio::task::spawn_local(async move {
+            while let Some(notice) = rx.recv().await {
+                match notice {
+                    RobotNotice::Report(report) => log.reports.borrow_mut().push(*report),
+                    other => log.notices.borrow_mut().push(other),
+                }
+            }
+        });
+        Ok(robot)
+    }
+
+    /// Ends everything without a word.
+    fn kill(&self, network: &Network) {
+        network.remove(host(1));
+        self.tasks.iter().for_each(tokio::task::AbortHandle::abort);
+    }
+
     /// Every tick so far.
     pub fn reports(&self) -> std::cell::Ref<'_, Vec<Report>> {
         self.reports.borrow()
@@ -117,6 +187,24 @@ impl Robot {
 }
 
 impl Operator {
+    /// Ends it without a word, as `kill -9` does.
+    pub fn kill(&self, network: &Network) {
+        network.remove(self.addr);
+        self.done.abort();
+    }
+
+    /// Moves it to another address of the network, as a laptop that changes from one network to another; the links
+    /// there are whatever [`Network::link`] says.
+    ///
+    /// # Errors
+    /// [`PairError::Runtime`] if QUIC does not take the socket.
+    pub fn rebind(&mut self, network: &Network, to: SocketAddr) -> Result<(), PairError> {
+        let socket = network.socket(to);
+        network.remove(self.addr);
+        self.addr = to;
+        Ok(self.endpoint.rebind_abstract(socket)?)
+    }
+
     /// A word at the operator's own terminal.
     pub fn say(&self, word: Word) {
         // The daemon has ended if nobody hears it.
@@ -139,62 +227,29 @@ impl Pair {
         let clock = HostClock::from_zero();
         let robot_identity = Identity::ephemeral()?;
         let operator_identity = Identity::ephemeral()?;
-        let (rings, handle) = servo::rings();
-        let mut core = rig.servo(rings);
-        let period = Duration::from_secs_f64(core.tick_s());
-        tokio::task::spawn_local(async move {
-            let mut tick = interval(period);
-            tick.set_missed_tick_behavior(MissedTickBehavior::Burst);
-            loop {
-                tick.tick().await;
-                core.tick(clock.now());
-            }
-        });
-        let socket = quic::Socket::Abstract {
-            socket: network.socket(host(1)),
-            seed: [1; 32],
-        };
-        let endpoint = quic::server(
-            &robot_identity,
-            vec![operator_identity.fingerprint()],
-            socket,
-            &Meter::default(),
-        )?;
-        let daemon = RobotDaemon::new(
-            endpoint,
-            clock,
-            rig.info(),
-            Default::default(),
-            handle,
-            None,
-        );
-        let (quit, quit_rx) = watch::channel(false);
-        let (tx, mut rx) = mpsc::unbounded_channel();
-        let (words, words_rx) = mpsc::unbounded_channel();
-        tokio::task::spawn_local(daemon.run(quit_rx, words_rx, tx));
-        let robot = Robot {
-            reports: Rc::default(),
-            notices: Rc::default(),
-            quit,
-            words,
-        };
-        let log = robot.clone();
-        tokio::task::spawn_local(async move {
-            while let Some(notice) = rx.recv().await {
-                match notice {
-                    RobotNotice::Report(report) => log.reports.borrow_mut().push(*report),
-                    other => log.notices.borrow_mut().push(other),
-                }
-            }
-        });
+        let trust = Trust::new([operator_identity.fingerprint()]);
+        let robot = Robot::start(&network, clock, rig, &robot_identity, &trust)?;
         Ok(Self {
             network,
             robot,
+            trust,
             clock,
             robot_identity,
             operator_identity,
             operators: 0,
         })
+    }
+
+    /// Kills the robot, as a power cut does, and starts it again at once: the same key, the same address, the arm in its
+    /// start posture, no session, no model.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn restart_robot(&mut self, rig: &Rig) -> Result<(), PairError> {
+        self.robot.kill(&self.network);
+        let identity = &self.robot_identity;
+        self.robot = Robot::start(&self.network, self.clock, rig, identity, &self.trust)?;
+        Ok(())
     }
 
     /// Now on the common clock.
@@ -248,15 +303,46 @@ impl Pair {
     pub fn operator_as(
         &mut self,
         identity: &Identity,
-        mut task: Task,
+        task: Task,
         skill: Option<Arc<Skill>>,
         config: SessionConfig,
         link: &LinkConfig,
         seed: u64,
     ) -> Result<Operator, PairError> {
-        let (endpoint, meter) = self.client(identity, link, seed)?;
+        let trust = Trust::new([self.robot_identity.fingerprint()]);
+        self.operator_with(identity, trust, task, (skill, config), link, seed)
+    }
+
+    /// As [`Pair::operator`], without a skill, for a robot with the key `robot`.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn operator_that_expects(
+        &mut self,
+        robot: Fingerprint,
+        task: Task,
+        link: &LinkConfig,
+        seed: u64,
+    ) -> Result<Operator, PairError> {
+        let identity = self.operator_identity_copy()?;
+        let driving = (None, SessionConfig::default());
+        self.operator_with(&identity, Trust::new([robot]), task, driving, link, seed)
+    }
+
+    fn operator_with(
+        &mut self,
+        identity: &Identity,
+        trust: Trust,
+        mut task: Task,
+        (skill, config): (Option<Arc<Skill>>, SessionConfig),
+        link: &LinkConfig,
+        seed: u64,
+    ) -> Result<Operator, PairError> {
+        let (endpoint, meter) = self.client(identity, &trust, link, seed)?;
+        let (endpoint_copy, addr) = (endpoint.clone(), host(1 + self.operators));
         let daemon = OperatorDaemon {
             endpoint,
+            trust,
             meter,
             robot: host(1),
             clock: self.clock,
@@ -276,6 +362,8 @@ impl Pair {
         Ok(Operator {
             done,
             notices,
+            addr,
+            endpoint: endpoint_copy,
             quit,
             words,
         })
@@ -287,7 +375,32 @@ impl Pair {
     /// [`PairError`].
     pub fn stranger(&mut self, link: &LinkConfig, seed: u64) -> Result<quinn::Endpoint, PairError> {
         let identity = self.operator_identity_copy()?;
-        Ok(self.client(&identity, link, seed)?.0)
+        let trust = Trust::new([self.robot_identity.fingerprint()]);
+        Ok(self.client(&identity, &trust, link, seed)?.0)
+    }
+
+    /// A client that wants to be paired, on this link.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn suitor(
+        &mut self,
+        identity: &Identity,
+        link: &LinkConfig,
+        seed: u64,
+    ) -> Result<quinn::Endpoint, PairError> {
+        let socket = self.place(link, seed);
+        Ok(quic::pairing_client(identity, socket)?)
+    }
+
+    /// The robot's key.
+    pub fn robot_key(&self) -> Fingerprint {
+        self.robot_identity.fingerprint()
+    }
+
+    /// The operator's, which the robot trusts from the start.
+    pub fn operator_key(&self) -> Fingerprint {
+        self.operator_identity.fingerprint()
     }
 
     /// Where the robot listens.
@@ -306,19 +419,22 @@ impl Pair {
     fn client(
         &mut self,
         identity: &Identity,
+        trust: &Trust,
         link: &LinkConfig,
         seed: u64,
     ) -> Result<(quinn::Endpoint, Meter), PairError> {
+        let (socket, meter) = (self.place(link, seed), Meter::default());
+        Ok((quic::client(identity, trust, socket, &meter)?, meter))
+    }
+
+    /// The socket of one more client.
+    fn place(&mut self, link: &LinkConfig, seed: u64) -> quic::Socket {
         self.operators += 1;
-        let own = host(1 + self.operators);
         self.set_link(self.operators, link, seed);
-        let meter = Meter::default();
-        let socket = quic::Socket::Abstract {
-            socket: self.network.socket(own),
+        quic::Socket::Abstract {
+            socket: self.network.socket(host(1 + self.operators)),
             seed: [self.operators + 1; 32],
-        };
-        let endpoint = quic::client(identity, self.robot_identity.fingerprint(), socket, &meter)?;
-        Ok((endpoint, meter))
+        }
     }
 
     fn operator_identity_copy(&self) -> Result<Identity, IdentityError> {

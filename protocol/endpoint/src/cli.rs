@@ -118,6 +118,46 @@ pub enum Word {
     Stop,
     /// `reset`: leave the latched stop.
     Reset,
+    /// `pair` or `pair 30s`: open a pairing window (robot).
+    Pair(Duration),
+    /// `yes`: the codes are the same.
+    Yes,
+    /// `no`: they are not.
+    No,
+}
+
+/// How long a window is open that was asked for without saying how long.
+pub const PAIRING_WINDOW: Duration = Duration::from_secs(60);
+
+/// The longest pairing window.
+pub const LONGEST_WINDOW: Duration = Duration::from_secs(600);
+
+/// What a line typed at a terminal means.
+fn word(line: &str) -> Option<Word> {
+    let mut parts = line.split_whitespace();
+    let word = match parts.next()? {
+        "stop" => Word::Stop,
+        "reset" => Word::Reset,
+        "yes" => Word::Yes,
+        "no" => Word::No,
+        "pair" => Word::Pair(parts.next().map_or(Ok(PAIRING_WINDOW), seconds).ok()?),
+        _ => return None,
+    };
+    parts.next().is_none().then_some(word)
+}
+
+/// A length of time of whole or broken seconds: `60s`, `60` or `0.5s`; at most ten minutes.
+///
+/// # Errors
+/// One line that says what to write.
+pub fn seconds(text: &str) -> Result<Duration, String> {
+    let number = text.strip_suffix('s').unwrap_or(text).parse::<f64>();
+    let number = number
+        .ok()
+        .filter(|s| *s > 0.0 && *s <= LONGEST_WINDOW.as_secs_f64());
+    number
+        .map(Duration::from_secs_f64)
+        .ok_or_else(|| format!("`{text}`: write seconds, for example 60s, and at most 600s"))
 }
 
 /// Resolves once the watch is true, or its sender is gone.
@@ -125,13 +165,14 @@ pub async fn told(quit: &mut watch::Receiver<bool>) {
     let _ = quit.wait_for(|quit| *quit).await;
 }
 
-/// Ctrl-C, SIGTERM, `quit`, or (if asked for) the end of stdin turn the watch true; `stop` and `reset` arrive
-/// as words (`stop` is also called at once, on the reading thread). stdin is read only when it is a terminal or `follow_stdin` is set.
+/// Ctrl-C, SIGTERM, `quit`, or (if asked for) the end of stdin turn the watch true; the other words arrive as
+/// such; what is none is answered with `help` (`stop` is also called at once, on the reading thread). stdin is read only when it is a terminal or `follow_stdin` is set.
 ///
 /// # Errors
 /// The system's, if signals cannot be caught.
 pub fn listen(
     follow_stdin: bool,
+    help: &'static str,
     stop: impl Fn() + Send + 'static,
 ) -> io::Result<(watch::Receiver<bool>, mpsc::UnboundedReceiver<Word>)> {
     let (quit_tx, quit) = watch::channel(false);
@@ -152,16 +193,17 @@ pub fn listen(
         // A thread of its own, never joined: a blocking read cannot be cancelled, and ends with the process.
         thread::Builder::new().name("stdin".into()).spawn(move || {
             for line in io::stdin().lock().lines().map_while(Result::ok) {
-                match line.trim() {
-                    "stop" => {
-                        stop();
-                        let _ = word_tx.send(Word::Stop);
+                if line.trim() == "quit" {
+                    break;
+                }
+                match word(&line) {
+                    Some(word) => {
+                        if word == Word::Stop {
+                            stop();
+                        }
+                        let _ = word_tx.send(word);
                     }
-                    "reset" => {
-                        let _ = word_tx.send(Word::Reset);
-                    }
-                    "quit" => break,
-                    _ => eprintln!("stop, reset or quit?"),
+                    None => eprintln!("{help}"),
                 }
             }
             quit_tx.send_replace(true);
@@ -195,5 +237,25 @@ mod tests {
             Ok(SocketAddr::from(([127, 0, 0, 1], 80)))
         );
         assert!(resolve("127.0.0.1").is_err());
+    }
+
+    #[test]
+    fn words_are_understood_whole_or_not_at_all() {
+        for (line, meant) in [
+            (" stop ", Some(Word::Stop)),
+            ("reset", Some(Word::Reset)),
+            ("pair", Some(Word::Pair(PAIRING_WINDOW))),
+            ("pair 0.5s", Some(Word::Pair(Duration::from_millis(500)))),
+            ("yes", Some(Word::Yes)),
+            ("no", Some(Word::No)),
+            ("", None),
+            ("stop it", None),
+            ("pair 0", None),
+            ("pair 601s", None),
+            ("pair soon", None),
+            ("pair nan", None),
+        ] {
+            assert_eq!(word(line), meant, "{line}");
+        }
     }
 }

@@ -83,6 +83,11 @@ impl HostClock {
     }
 }
 
+/// Seconds since 1970 on the host's wall clock, which may be stepped at any time: to date a note by, nothing else.
+pub fn wall_s() -> i64 {
+    clock_gettime(ClockId::Realtime).tv_sec
+}
+
 impl Default for HostClock {
     fn default() -> Self {
         Self::new()

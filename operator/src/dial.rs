@@ -1,0 +1,211 @@
+//! How a robot is reached, the first time and after every loss of the link.
+//!
+//! A link that has just come back carries a *fresh* attempt at once, while an older one waits for a retransmission
+//! that QUIC has put off further and further. So attempts begin at a steady pace and overlap; the first of
+//! them that the robot greets is the session, and the others are dropped.
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use quinn::{Connection, Endpoint};
+use telemime_endpoint::control::{Control, ControlError, Writer};
+use telemime_endpoint::quic::{self, Refusal};
+use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
+use telemime_protocol::wire::v1;
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use tokio::time::{Instant, sleep_until, timeout};
+
+/// Attempts begin this far apart.
+pub const REDIAL: Duration = Duration::from_millis(250);
+
+/// An attempt is given at least this long, and at least this many of the round trips last seen.
+const LEAST_ATTEMPT: Duration = Duration::from_millis(500);
+const ROUND_TRIPS: u32 = 4;
+
+/// The longest time-out of an attempt.
+const LONGEST_ATTEMPT: Duration = Duration::from_secs(10);
+
+/// Application close code of a robot that does not trust our key (docs/protocol.md §1).
+const NOT_TRUSTED: u32 = 5;
+
+/// A session's connection, greeted.
+pub(crate) struct Link {
+    pub(crate) connection: Connection,
+    pub(crate) writer: Writer,
+    pub(crate) frames: mpsc::Receiver<Result<Frame, ControlError>>,
+    pub(crate) epoch: u32,
+}
+
+/// Why an attempt did not become a session.
+#[derive(Debug)]
+pub(crate) enum DialError {
+    /// The next one may.
+    Again(String),
+    /// The robot declines.
+    Rejected { code: RejectCode, text: String },
+    /// The robot's key is not the one that is pinned.
+    KeyChanged,
+    /// The robot has revoked our key.
+    Revoked,
+}
+
+/// How long attempts may take.
+///
+/// Most are given four round trips, no less than 0.5 s: time enough if the link is what it was. One at a time is
+/// *patient*: its time-out doubles as such attempts fail, up to 10 s, for a link that has become slower. If all
+/// were, forty of them would be retransmitting after a longer outage.
+#[derive(Debug, Clone, Copy)]
+struct Pace {
+    brisk: Duration,
+    patient: Duration,
+}
+
+impl Pace {
+    fn new(rtt: Option<Duration>) -> Self {
+        let brisk = rtt.map_or(LEAST_ATTEMPT, |rtt| rtt * ROUND_TRIPS);
+        let brisk = brisk.clamp(LEAST_ATTEMPT, LONGEST_ATTEMPT);
+        Self {
+            brisk,
+            patient: brisk,
+        }
+    }
+
+    fn next_patient(&mut self) -> Duration {
+        self.patient = (self.patient * 2).min(LONGEST_ATTEMPT);
+        self.patient
+    }
+}
+
+/// Attempts under way.
+pub(crate) struct Dialler {
+    endpoint: Endpoint,
+    robot: SocketAddr,
+    pace: Pace,
+    attempts: JoinSet<(bool, Result<Link, DialError>)>,
+    patient: bool,
+    next: Instant,
+}
+
+impl Dialler {
+    /// Begins with the first poll of [`Dialler::next`]; `rtt` is the round trip last seen.
+    pub(crate) fn new(endpoint: &Endpoint, robot: SocketAddr, rtt: Option<Duration>) -> Self {
+        Self {
+            endpoint: endpoint.clone(),
+            robot,
+            pace: Pace::new(rtt),
+            attempts: JoinSet::new(),
+            patient: false,
+            next: Instant::now(),
+        }
+    }
+
+    /// The outcome of an attempt; `None` when a new one has begun instead, so that the caller looks up from time
+    /// to time. Loses nothing if it is dropped.
+    pub(crate) async fn next(&mut self) -> Option<Result<Link, DialError>> {
+        tokio::select! {
+            biased;
+            Some(done) = self.attempts.join_next(), if !self.attempts.is_empty() => {
+                let (patient, outcome) = done.unwrap_or_else(|e| (false, Err(DialError::Again(e.to_string()))));
+                if patient {
+                    self.patient = false;
+                }
+                Some(outcome)
+            }
+            () = sleep_until(self.next) => {
+                self.next = Instant::now() + REDIAL;
+                let patient = !std::mem::replace(&mut self.patient, true);
+                let within = if patient { self.pace.next_patient() } else { self.pace.brisk };
+                let connecting = connect(self.endpoint.clone(), self.robot);
+                self.attempts.spawn(async move {
+                    let silent = || Err(DialError::Again("no answer: is the robot running, and does UDP reach it?".into()));
+                    (patient, timeout(within, connecting).await.unwrap_or_else(|_| silent()))
+                });
+                None
+            }
+        }
+    }
+}
+
+async fn connect(endpoint: Endpoint, robot: SocketAddr) -> Result<Link, DialError> {
+    let connecting = endpoint
+        .connect(robot, "telemime")
+        .map_err(|e| DialError::Again(e.to_string()))?;
+    let connection = connecting.await.map_err(|e| failed(&e))?;
+    // With TLS 1.3 the handshake seems complete before the server has looked at our key.
+    let again = |e: ControlError| match &e {
+        ControlError::Connection(lost) => failed(lost),
+        _ => connection
+            .close_reason()
+            .map_or_else(|| DialError::Again(e.to_string()), |lost| failed(&lost)),
+    };
+    let mut control = Control::open(&connection).await.map_err(again)?;
+    let hello = Hello {
+        min: v1::VERSION,
+        max: v1::VERSION,
+        features: 0,
+    };
+    control.write(&hello.encode()).await.map_err(again)?;
+    match control.answer().await.map_err(again)? {
+        Answer::Ack {
+            version: v1::VERSION,
+            epoch,
+            ..
+        } => {
+            let (writer, frames) = control.into_frames();
+            Ok(Link {
+                connection,
+                writer,
+                frames,
+                epoch,
+            })
+        }
+        Answer::Ack { version, .. } => Err(DialError::Rejected {
+            code: RejectCode::Version,
+            text: format!("it answers with version {version}, which we did not offer"),
+        }),
+        Answer::Reject { code, text } => Err(DialError::Rejected { code, text }),
+    }
+}
+
+fn failed(error: &quinn::ConnectionError) -> DialError {
+    if let quinn::ConnectionError::ApplicationClosed(close) = error
+        && close.error_code == NOT_TRUSTED.into()
+    {
+        return DialError::Again(quic::explain(error));
+    }
+    match quic::refusal(error) {
+        Some(Refusal::KeyUnknown | Refusal::KeyRevoked) => DialError::KeyChanged,
+        Some(Refusal::OurKeyRevoked) => DialError::Revoked,
+        Some(Refusal::OurKeyUnknown | Refusal::Version) | None => {
+            DialError::Again(quic::explain(error))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn attempts_take_four_round_trips_and_one_of_them_is_ever_more_patient() {
+        let ms = Duration::from_millis;
+        for (rtt, brisk) in [
+            (None, 500),
+            (Some(20), 500),
+            (Some(125), 500),
+            (Some(600), 2400),
+            (Some(60_000), 10_000),
+        ] {
+            let mut pace = Pace::new(rtt.map(ms));
+            assert_eq!(pace.brisk, ms(brisk), "{rtt:?}");
+            let mut due = brisk;
+            for _ in 0..8 {
+                due = (2 * due).min(10_000);
+                assert_eq!(pace.next_patient(), ms(due));
+            }
+            assert_eq!(due, 10_000);
+        }
+    }
+}
