@@ -18,7 +18,7 @@ use serde::Deserialize;
 use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
 use telemime_endpoint::peers::{Peers, PeersError, Role, Source, Whom};
-use telemime_endpoint::{Fingerprint, HostClock, Identity, Meter, Mono, Trust, quic};
+use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Mono, Trust, quic};
 use tokio::sync::mpsc;
 
 use crate::daemon::Daemon;
@@ -53,6 +53,10 @@ pub struct Args {
     /// The robots that were paired [default: ~/.config/telemime/peers].
     #[arg(long, value_name = "FILE")]
     pub peer_file: Option<PathBuf>,
+    /// The system clock is kept right (by PTP, chrony or the like) to within this, 50us for example; if the robot's is
+    /// too, a path slower one way than the other is seen [default: round trips alone].
+    #[arg(long, value_name = "TIME", value_parser = cli::dispersion)]
+    pub clock_dispersion: Option<Duration>,
     /// Learn a skill from this folder of demonstrations (CSV: t,x,y,z) at the start; may be repeated.
     #[arg(long, value_name = "DIR")]
     pub learn: Vec<PathBuf>,
@@ -189,6 +193,7 @@ struct File {
     identity: Option<PathBuf>,
     peer: Option<String>,
     peer_file: Option<PathBuf>,
+    clock_dispersion: Option<String>,
     #[serde(default)]
     learn: Vec<PathBuf>,
     #[serde(rename = "match")]
@@ -237,6 +242,9 @@ impl Args {
         self.identity = self.identity.or(file.identity);
         self.peer = self.peer.or(file.peer);
         self.peer_file = self.peer_file.or(file.peer_file);
+        let dispersion = file.clock_dispersion.as_deref().map(cli::dispersion);
+        let dispersion = dispersion.transpose().map_err(anyhow::Error::msg)?;
+        self.clock_dispersion = self.clock_dispersion.or(dispersion);
         if self.learn.is_empty() && self.skill.is_empty() {
             (self.learn, self.skill) = (file.learn, file.skills);
         }
@@ -373,6 +381,7 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         clock,
         // A second before now, so that a sensor's latency may be subtracted from the first sample.
         epoch: Mono(clock.now().0 - 1_000_000_000),
+        external: args.clock_dispersion.map(External::host),
         skill: skills.mirror(),
         recogniser: skills.recogniser(&log),
         config,

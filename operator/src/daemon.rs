@@ -10,7 +10,9 @@ use quinn::{Connection, Endpoint, VarInt};
 use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::ControlError;
 use telemime_endpoint::meter::Counts;
-use telemime_endpoint::{Fingerprint, HostClock, Meter, Mono, Standing, Trust, quic, trust};
+use telemime_endpoint::{
+    External, Fingerprint, HostClock, Meter, Mono, Standing, Trust, quic, trust,
+};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::DecodeError;
@@ -38,6 +40,8 @@ pub struct Daemon {
     pub clock: HostClock,
     /// Zero of the session clock.
     pub epoch: Mono,
+    /// A clock that is kept right from outside, if there is one.
+    pub external: Option<External>,
     /// What to predict with.
     pub skill: Option<Arc<Skill>>,
     /// Says which skill the hand performs, if anybody wants to know.
@@ -397,7 +401,10 @@ impl Daemon {
                     None => return End::Lost("control stream ended".into()),
                 },
                 datagram = link.connection.read_datagram() => match datagram {
-                    Ok(bytes) => session.handle_datagram(self.now(), &bytes),
+                    Ok(bytes) => {
+                        session.set_external(self.external.as_ref().map(|e| e.message(self.epoch)));
+                        session.handle_datagram(self.now(), &bytes);
+                    }
                     Err(e) => return End::Lost(quic::explain(&e)),
                 },
                 () = sleep_until(self.instant(due.unwrap_or(now))), if due.is_some() => {

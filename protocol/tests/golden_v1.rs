@@ -247,8 +247,22 @@ fn operator_datagrams() {
                 t1_us: -5_000_000_000,
                 t2_us: 125,
                 t3_us: -126,
+                external: None,
             },
-            "0201fdffe30b5402000000fafbfb00",
+            "0201fdffe30b5402000000fafbfb0000",
+        ),
+        (
+            OperatorDatagram::Pong {
+                epoch: 1,
+                t1_us: 0,
+                t2_us: 0,
+                t3_us: 0,
+                external: Some(ExternalClock {
+                    ahead_us: 1_792_000_000_000_000,
+                    dispersion_us: 50,
+                }),
+            },
+            "020100000001fd0000e006a1bb0c0032",
         ),
         (OperatorDatagram::Stop { epoch: 65_536 }, "03fc00000100"),
     ]);

@@ -13,10 +13,11 @@ use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
 use telemime_endpoint::pairing::{Candidate, Own};
 use telemime_endpoint::peers::{Role, Source, Whom};
-use telemime_endpoint::{Fingerprint, HostClock, Identity, Meter, Trust, quic};
+use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Trust, quic};
 use telemime_sim::arm::LoadOptions;
 use tokio::sync::mpsc;
 
+use crate::clock::Origin;
 use crate::control::ControlConfig;
 use crate::daemon::{Daemon, Notice};
 use crate::desk::{Desk, Progress};
@@ -53,6 +54,10 @@ pub struct Args {
     /// Pair only with the key of this fingerprint, and without asking.
     #[arg(long, value_name = "FINGERPRINT")]
     pub pair_expect: Option<String>,
+    /// The system clock is kept right (by PTP, chrony or the like) to within this, 50us for example; if the operator's
+    /// is too, a path slower one way than the other is seen [default: round trips alone].
+    #[arg(long, value_name = "TIME", value_parser = cli::dispersion)]
+    pub clock_dispersion: Option<Duration>,
     /// What this robot calls itself to operators that pair [default: the host's name].
     #[arg(long, value_name = "NAME")]
     pub name: Option<String>,
@@ -94,6 +99,7 @@ struct File {
     peers: Vec<String>,
     peer_file: Option<PathBuf>,
     name: Option<String>,
+    clock_dispersion: Option<String>,
     urdf: Option<PathBuf>,
     tip: Option<String>,
     #[serde(default)]
@@ -136,6 +142,7 @@ pub enum Event {
         dropped: u32,
         clock_offset_s: Option<f64>,
         clock_bound_s: Option<f64>,
+        clock_origin: String,
     },
     Refused {
         reason: String,
@@ -208,6 +215,9 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         .collect::<Result<Vec<Fingerprint>, _>>()?;
     let expected = args.pair_expect.as_ref().map(|text| text.parse());
     let expected: Option<Fingerprint> = expected.transpose()?;
+    let dispersion = file.clock_dispersion.as_deref().map(cli::dispersion);
+    let dispersion = dispersion.transpose().map_err(anyhow::Error::msg)?;
+    let dispersion = args.clock_dispersion.or(dispersion);
     let peer_file = args.peer_file.clone().or(file.peer_file);
     let source = Source {
         path: peer_file.unwrap_or_else(admin::peer_file),
@@ -306,6 +316,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         Some(running.timing.clone()),
         desk,
     );
+    let daemon = daemon.with_external(dispersion.map(External::host));
     let (notices, heard) = mpsc::unbounded_channel();
     let listener = tokio::spawn(listen_to(heard, log.clone(), recorder));
     let served = tokio::select! {
@@ -451,6 +462,7 @@ async fn listen_to(
             Notice::Disconnected {
                 why,
                 clock,
+                origin,
                 counters,
             } => {
                 let event = Event::Disconnected {
@@ -459,10 +471,18 @@ async fn listen_to(
                     dropped: counters.dropped,
                     clock_offset_s: clock.map(|c| c.0),
                     clock_bound_s: clock.map(|c| c.1),
+                    clock_origin: origin.word().to_owned(),
                 };
                 log.say(&event, || {
                     let clock = clock.map_or_else(String::new, |(_, bound_s)| {
-                        format!("; session clock known to ±{:.1} ms", bound_s * 1e3)
+                        let how = match origin {
+                            Origin::RoundTrips => "",
+                            Origin::Disciplined => " by the disciplined clocks",
+                            Origin::Contradicted => {
+                                " (the disciplined clocks are wrong by more than --clock-dispersion says: no round trip explains them)"
+                            }
+                        };
+                        format!("; session clock known to ±{:.2} ms{how}", bound_s * 1e3)
                     });
                     format!(
                         "session ended: {why}; {} motions, {} dropped{clock}",

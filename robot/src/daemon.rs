@@ -6,7 +6,7 @@ use std::time::Duration;
 use quinn::{Connection, Endpoint, Incoming, VarInt};
 use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{Control, ControlError, Writer};
-use telemime_endpoint::{Fingerprint, HostClock, Mono, Standing, Trust, quic, trust};
+use telemime_endpoint::{External, Fingerprint, HostClock, Mono, Standing, Trust, quic, trust};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode, negotiate};
@@ -15,6 +15,7 @@ use telemime_protocol::wire::v1::{self, Cause, Info, RobotState};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep_until};
 
+use crate::clock::Origin;
 use crate::desk::{Desk, Progress};
 use crate::refused::{Reason, Refused, Tally};
 use crate::servo::thread::Timing;
@@ -65,6 +66,7 @@ pub struct Daemon {
     timing: Option<Arc<Timing>>,
     /// Whom it trusts, and how that grows.
     desk: Desk,
+    external: Option<External>,
     refused: Tally,
     silent_drains: u32,
 }
@@ -85,6 +87,8 @@ pub enum Notice {
         why: String,
         /// The clock's offset estimate, s, and the bound of its error, s.
         clock: Option<(f64, f64)>,
+        /// Where that came from.
+        origin: Origin,
         /// What the session counted.
         counters: Counters,
     },
@@ -150,9 +154,17 @@ impl Daemon {
             servo,
             timing,
             desk,
+            external: None,
             refused: Tally::default(),
             silent_drains: 0,
         }
+    }
+
+    /// The same with a clock that is kept right from outside.
+    #[must_use]
+    pub fn with_external(mut self, external: Option<External>) -> Self {
+        self.external = external;
+        self
     }
 
     /// Serves operators until `quit` turns true; then the arm is stopped (latched) and the endpoint closed.
@@ -203,7 +215,7 @@ impl Daemon {
                         return Err(ServoDead);
                     }
                 }
-                why = receive(active.as_mut(), &self.clock, &trust) => if let Some(why) = why {
+                why = receive(active.as_mut(), &self.clock, self.external.as_ref(), &trust) => if let Some(why) = why {
                     self.end(&mut active, &mut skill, (why.0, &why.1), &notices);
                 },
                 () = sleep_until(due.unwrap_or_else(tokio::time::Instant::now)), if due.is_some() => {
@@ -431,7 +443,7 @@ impl Daemon {
             let _ = notices.send(Notice::Path(knots.collect()));
         }
         let now = self.clock.now();
-        let clock = ended.clock();
+        let (clock, origin) = (ended.clock(), ended.clock().origin(now));
         let clock = clock
             .to_session(now)
             .zip(clock.uncertainty_s(now))
@@ -440,6 +452,7 @@ impl Daemon {
         let _ = notices.send(Notice::Disconnected {
             why: why.to_owned(),
             clock,
+            origin,
             counters,
         });
     }
@@ -449,6 +462,7 @@ impl Daemon {
 async fn receive(
     active: Option<&mut Active>,
     clock: &HostClock,
+    external: Option<&External>,
     trust: &Trust,
 ) -> Option<(u32, String)> {
     let Some(active) = active else {
@@ -466,6 +480,7 @@ async fn receive(
         },
         datagram = active.connection.read_datagram() => match datagram {
             Ok(bytes) => {
+                active.session.set_external(external.map(|e| e.message(Mono(0))));
                 active.session.handle_datagram(clock.now(), &bytes);
                 None
             }

@@ -12,7 +12,7 @@ use telemime_endpoint::pairing::Own;
 use telemime_endpoint::peers::Name;
 use telemime_endpoint::quic::EndpointError;
 use telemime_endpoint::{
-    Fingerprint, HostClock, Identity, IdentityError, Meter, Mono, Trust, quic,
+    External, Fingerprint, HostClock, Identity, IdentityError, Meter, Mono, Trust, quic,
 };
 use telemime_operator::daemon::{
     Daemon as OperatorDaemon, DaemonError, Notice as OperatorNotice, Summary,
@@ -76,6 +76,7 @@ pub struct Pair {
     /// Whom the robot trusts.
     pub trust: Trust,
     clock: HostClock,
+    external: Option<(External, External)>,
     robot_identity: Identity,
     operator_identity: Identity,
     operators: u8,
@@ -111,6 +112,7 @@ impl Robot {
         rig: &Rig,
         identity: &Identity,
         trust: &Trust,
+        external: Option<External>,
     ) -> Result<Self, PairError> {
         let (rings, handle) = servo::rings();
         let mut core = rig.servo(rings);
@@ -134,7 +136,8 @@ impl Robot {
         };
         let desk = Desk::new(own, trust.clone(), None);
         let config = Default::default();
-        let daemon = RobotDaemon::new(endpoint, clock, rig.info(), config, handle, None, desk);
+        let daemon = RobotDaemon::new(endpoint, clock, rig.info(), config, handle, None, desk)
+            .with_external(external);
         let (quit, quit_rx) = watch::channel(false);
         let (tx, mut rx) = mpsc::unbounded_channel();
         let (words, words_rx) = mpsc::unbounded_channel();
@@ -223,17 +226,30 @@ impl Pair {
     /// # Errors
     /// [`PairError`].
     pub fn start(rig: &Rig) -> Result<Self, PairError> {
+        Self::start_with(rig, None)
+    }
+
+    /// As [`Pair::start`], with disciplined clocks at the robot and at the operators.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn start_with(
+        rig: &Rig,
+        external: Option<(External, External)>,
+    ) -> Result<Self, PairError> {
         let network = Network::new();
         let clock = HostClock::from_zero();
         let robot_identity = Identity::ephemeral()?;
         let operator_identity = Identity::ephemeral()?;
         let trust = Trust::new([operator_identity.fingerprint()]);
-        let robot = Robot::start(&network, clock, rig, &robot_identity, &trust)?;
+        let robots = external.as_ref().map(|(robot, _)| robot.clone());
+        let robot = Robot::start(&network, clock, rig, &robot_identity, &trust, robots)?;
         Ok(Self {
             network,
             robot,
             trust,
             clock,
+            external,
             robot_identity,
             operator_identity,
             operators: 0,
@@ -248,7 +264,9 @@ impl Pair {
     pub fn restart_robot(&mut self, rig: &Rig) -> Result<(), PairError> {
         self.robot.kill(&self.network);
         let identity = &self.robot_identity;
-        self.robot = Robot::start(&self.network, self.clock, rig, identity, &self.trust)?;
+        let external = self.external.as_ref().map(|(robot, _)| robot.clone());
+        let (network, clock) = (&self.network, self.clock);
+        self.robot = Robot::start(network, clock, rig, identity, &self.trust, external)?;
         Ok(())
     }
 
@@ -347,6 +365,7 @@ impl Pair {
             robot: host(1),
             clock: self.clock,
             epoch: SESSION_ZERO,
+            external: self.external.as_ref().map(|(_, operator)| operator.clone()),
             skill,
             recogniser: None,
             config,

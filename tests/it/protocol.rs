@@ -351,6 +351,7 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
                 t1_us: 90_000_000,
                 t2_us: 3_000_000,
                 t3_us: 3_000_000,
+                external: None,
             }),
         ),
         ("stop", message(&OperatorDatagram::Stop { epoch: 7 })),
@@ -527,6 +528,7 @@ fn a_plan_that_does_not_begin_at_zero_is_refused() {
             t1_us: 0,
             t2_us: 0,
             t3_us: 0,
+            external: None,
         };
         session.handle_datagram(Mono(1), &pong.encode());
     }

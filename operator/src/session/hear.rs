@@ -97,6 +97,7 @@ impl Session {
                     t1_us,
                     t2_us: t_us,
                     t3_us: t_us,
+                    external: self.external,
                 });
             }
             Ok(RobotDatagram::Telemetry(telemetry)) if telemetry.epoch == self.epoch => {

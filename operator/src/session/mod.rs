@@ -20,7 +20,8 @@ use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::v1::{
-    Drive, Engage, Info, Message, OperatorControl, OperatorDatagram, PathTail, Refusal, RobotState,
+    Drive, Engage, ExternalClock, Info, Message, OperatorControl, OperatorDatagram, PathTail,
+    Refusal, RobotState,
 };
 
 use crate::recognise::{Recogniser, Verdict};
@@ -58,6 +59,7 @@ pub struct Session {
     changes: u32,
     hand: Option<Hand>,
     recogniser: Option<Recogniser>,
+    external: Option<ExternalClock>,
     verdict: Option<Verdict>,
     activity: Activity,
     engagement: u32,
@@ -88,6 +90,7 @@ impl Session {
             changes: 0,
             hand: None,
             recogniser: None,
+            external: None,
             verdict: None,
             activity: Activity::Nothing,
             engagement: 0,
@@ -110,6 +113,11 @@ impl Session {
     pub fn watched_by(mut self, recogniser: Option<Recogniser>) -> Self {
         self.recogniser = recogniser;
         self
+    }
+
+    /// What our disciplined clock says now, relative to the session clock, if we have one.
+    pub fn set_external(&mut self, external: Option<ExternalClock>) {
+        self.external = external;
     }
 
     /// What the robot said of itself.

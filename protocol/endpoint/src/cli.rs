@@ -160,6 +160,21 @@ pub fn seconds(text: &str) -> Result<Duration, String> {
         .ok_or_else(|| format!("`{text}`: write seconds, for example 60s, and at most 600s"))
 }
 
+/// How wrong a disciplined clock may be: `50us`, `0.2ms` or `0.001s`, at most a second.
+///
+/// # Errors
+/// One line that says what to write.
+pub fn dispersion(text: &str) -> Result<Duration, String> {
+    let scaled = [("us", 1e-6), ("ms", 1e-3), ("s", 1.0)]
+        .into_iter()
+        .find_map(|(unit, s)| Some((text.strip_suffix(unit)?, s)));
+    let seconds = scaled.and_then(|(number, s)| Some(number.trim().parse::<f64>().ok()? * s));
+    seconds
+        .filter(|s| *s > 0.0 && *s <= 1.0)
+        .map(Duration::from_secs_f64)
+        .ok_or_else(|| format!("`{text}`: write for example 50us or 2ms, at most 1s"))
+}
+
 /// Resolves once the watch is true, or its sender is gone.
 pub async fn told(quit: &mut watch::Receiver<bool>) {
     let _ = quit.wait_for(|quit| *quit).await;
@@ -237,6 +252,16 @@ mod tests {
             Ok(SocketAddr::from(([127, 0, 0, 1], 80)))
         );
         assert!(resolve("127.0.0.1").is_err());
+    }
+
+    #[test]
+    fn a_dispersion_has_a_unit_and_a_limit() {
+        for (text, us) in [("50us", 50), ("0.2ms", 200), ("1s", 1_000_000)] {
+            assert_eq!(dispersion(text), Ok(Duration::from_micros(us)));
+        }
+        for bad in ["", "50", "us", "-1ms", "0s", "2s", "nans", "50 minutes"] {
+            assert!(dispersion(bad).is_err(), "{bad}");
+        }
     }
 
     #[test]

@@ -13,7 +13,7 @@ pub mod quic;
 pub mod tls;
 pub mod trust;
 
-pub use clock::{HostClock, Mono};
+pub use clock::{External, HostClock, Mono};
 pub use identity::{Fingerprint, Identity, IdentityError};
 pub use meter::Meter;
 pub use trust::{Standing, Trust};

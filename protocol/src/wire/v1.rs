@@ -284,12 +284,23 @@ pub enum OperatorDatagram {
         t2_us: i64,
         /// When this left.
         t3_us: i64,
+        /// What a disciplined clock at the operator says, if it has one.
+        external: Option<ExternalClock>,
     },
     /// Emergency stop, repeated until the robot reports [`RobotState::Stopped`].
     Stop {
         /// The session's epoch.
         epoch: u32,
     },
+}
+
+/// How the session clock lies to one that is kept right from outside (PTP, chrony).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ExternalClock {
+    /// Time since 1970 on that clock (as `CLOCK_REALTIME` counts it) less the session clock, µs.
+    pub ahead_us: i64,
+    /// How wrong that clock may be, µs.
+    pub dispersion_us: u32,
 }
 
 /// The newest state of the hand, and the knots of its path that are not yet acknowledged.

@@ -20,8 +20,8 @@ use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::turn::{WireRotation, dequantise_grip, quantise_grip};
 use telemime_protocol::wire::v1::{
-    Cause, Drive, Engage, Info, MAX_PLAN_LEN, Message, ModelId, OperatorControl, OperatorDatagram,
-    Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
+    Cause, Drive, Engage, ExternalClock, Info, MAX_PLAN_LEN, Message, ModelId, OperatorControl,
+    OperatorDatagram, Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
 };
 
 use crate::clock::{SessionClock, Slew};
@@ -97,6 +97,7 @@ pub struct Session {
     info: Info,
     epoch: u32,
     clock: SessionClock,
+    external: Option<ExternalClock>,
     skill: Option<Arc<Skill>>,
     plan: Option<(u32, PosePlan)>,
     mirror: Option<Mirror>,
@@ -129,6 +130,7 @@ impl Session {
             config,
             epoch,
             clock: SessionClock::default(),
+            external: None,
             skill,
             plan: None,
             mirror: None,
@@ -155,6 +157,11 @@ impl Session {
     /// The model held, for the next session.
     pub fn skill(&self) -> Option<Arc<Skill>> {
         self.skill.clone()
+    }
+
+    /// What the robot's own disciplined clock says now, relative to its monotonic one, if it has one.
+    pub fn set_external(&mut self, external: Option<ExternalClock>) {
+        self.external = external;
     }
 
     /// The clock estimate.
@@ -233,6 +240,7 @@ impl Session {
                 t1_us,
                 t2_us,
                 t3_us,
+                external,
             }) if epoch == self.epoch => {
                 let stamp = |us: i64| Stamp(us.saturating_mul(1000));
                 self.clock.observe(
@@ -241,6 +249,12 @@ impl Session {
                     stamp(t3_us),
                     now,
                 );
+                if let (Some(theirs), Some(ours)) = (external, self.external) {
+                    let ahead_us = ours.ahead_us.saturating_sub(theirs.ahead_us);
+                    let bound_us = f64::from(ours.dispersion_us) + f64::from(theirs.dispersion_us);
+                    let offset_ns = ahead_us.saturating_mul(1000);
+                    self.clock.observe_outside(now, offset_ns, bound_us * 1e-6);
+                }
                 self.follow_clock(now);
                 true
             }

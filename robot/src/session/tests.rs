@@ -142,6 +142,7 @@ impl Bench {
             t1_us: t1 / 1000,
             t2_us: at / 1000,
             t3_us: at / 1000,
+            external: None,
         });
     }
 

@@ -267,6 +267,7 @@ fn pings_are_answered_and_foreign_datagrams_counted() {
         t1_us: -5,
         t2_us: t_us,
         t3_us: t_us,
+        external: None,
     };
     assert_eq!(bench.datagrams, [pong]);
     bench.forget();
