@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 13] = [
+const COMMANDS: [&str; 16] = [
     "demo",
     "import",
     "learn",
@@ -16,6 +16,9 @@ const COMMANDS: [&str; 13] = [
     "codec",
     "robot",
     "operator",
+    "identity",
+    "pair",
+    "peers",
     "link",
     "paper",
 ];
