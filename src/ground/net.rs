@@ -29,6 +29,14 @@ struct State {
     links: BTreeMap<(SocketAddr, SocketAddr), Link>,
     down: bool,
     sockets: u64,
+    tape: Option<Vec<Taped>>,
+}
+
+/// A packet that somebody on the way has kept.
+struct Taped {
+    from: SocketAddr,
+    to: SocketAddr,
+    packet: Vec<u8>,
 }
 
 /// Sockets and the links between them, on tokio's clock.
@@ -50,6 +58,7 @@ impl Network {
             links: BTreeMap::new(),
             down: false,
             sockets: 0,
+            tape: None,
         })))
     }
 
@@ -88,6 +97,21 @@ impl Network {
         self.state().down = down;
     }
 
+    /// From now on keeps a copy of every packet that is delivered.
+    pub fn record(&self) {
+        self.state().tape = Some(Vec::new());
+    }
+
+    /// Delivers every packet that was kept once more, at once and in order, as somebody on the way could; how many.
+    pub fn replay(&self) -> usize {
+        let tape = self.state().tape.take().unwrap_or_default();
+        let count = tape.len();
+        for Taped { from, to, packet } in tape {
+            self.deliver(from, to, packet);
+        }
+        count
+    }
+
     fn state(&self) -> MutexGuard<'_, State> {
         self.0
             .lock()
@@ -123,6 +147,10 @@ impl Network {
 
     fn deliver(&self, from: SocketAddr, to: SocketAddr, packet: Vec<u8>) {
         let mut state = self.state();
+        if let Some(tape) = &mut state.tape {
+            let packet = packet.clone();
+            tape.push(Taped { from, to, packet });
+        }
         let Some(inbox) = state.inboxes.get_mut(&to) else {
             return;
         };

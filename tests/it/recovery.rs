@@ -1,11 +1,18 @@
 //! The link goes, and comes back; so do processes. How soon there is a session again, and what never happens.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::time::Duration;
+
 use nalgebra::Vector3;
 use telemime::ground::{Operator, Pair, run_virtual};
+use telemime_endpoint::External;
 use telemime_operator::daemon::Notice;
 use telemime_operator::session::Event;
 use telemime_operator::task::Task;
-use telemime_protocol::wire::v1::RobotState;
+use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::v1::{Cause, RobotState};
+use telemime_robot::clock::Origin;
 use telemime_robot::daemon::Notice as RobotNotice;
 use telemime_robot::servo::Report;
 use telemime_sim::link::LinkConfig;
@@ -247,6 +254,83 @@ fn a_robot_that_was_killed_and_started_again_is_found_at_once() {
             assert_eq!((heard.sessions, heard.engaged), (2, 1), "seed {seed}");
             assert!(!followed(&pair.robot.reports(), back), "seed {seed}");
         }
+    })
+    .unwrap();
+}
+
+/// How the robot saw the session clock when its last session ended: the error and its bound, s, and where from.
+fn clock_error(pair: &Pair) -> (f64, f64, Origin) {
+    let notices = pair.robot.notices();
+    let ended = notices.iter().rev().find_map(|n| match n {
+        RobotNotice::Disconnected {
+            clock: Some((offset_s, bound_s)),
+            origin,
+            ..
+        } => Some((*offset_s, *bound_s, *origin)),
+        _ => None,
+    });
+    let (offset_s, bound_s, origin) = ended.unwrap();
+    // The common clock shows minus this when the session clock shows 0.
+    let truth_s = -(pair.to_mono(Stamp(0)).0 as f64) * 1e-9;
+    (offset_s - truth_s, bound_s, origin)
+}
+
+/// An operator whose packets take 140 ms, and the robot's 60 ms.
+fn lopsided(pair: &mut Pair, seed: u64) -> Operator {
+    let operator = operator(pair, &delayed(0.1), seed);
+    let (ours, robot) = (operator.addr, pair.robot_addr());
+    pair.network.link(ours, robot, delayed(0.14), seed);
+    pair.network.link(robot, ours, delayed(0.06), seed + 1);
+    operator
+}
+
+#[test]
+fn disciplined_clocks_take_the_asymmetry_out_and_one_that_is_set_stops_the_arm() {
+    const DISPERSION: Duration = Duration::from_micros(50);
+    run_virtual(async {
+        let mut pair = Pair::start(&rig()).unwrap();
+        let operator = lopsided(&mut pair, 100);
+        pair.run_for(3.0).await;
+        operator.quit();
+        operator.done.await.unwrap().0.unwrap();
+        pair.run_for(0.5).await;
+        let (error_s, bound_s, origin) = clock_error(&pair);
+        assert_eq!(origin, Origin::RoundTrips);
+        assert!(
+            (error_s.abs() - 0.04).abs() < 2e-3,
+            "half the asymmetry: {error_s}"
+        );
+        assert!(bound_s > error_s.abs() && bound_s < 0.105, "{bound_s}");
+
+        let ahead = || Arc::new(AtomicI64::new(1_792_000_000_000_000_000));
+        let (robots, operators) = (ahead(), ahead());
+        let clocks = (
+            External::stated(robots, DISPERSION),
+            External::stated(operators.clone(), DISPERSION),
+        );
+        let mut pair = Pair::start_with(&rig(), Some(clocks)).unwrap();
+        let operator = lopsided(&mut pair, 102);
+        assert!(
+            pair.wait_for(20.0, |r| r.state == RobotState::Engaged)
+                .await
+        );
+        pair.run_for(1.0).await;
+        // Somebody sets the operator's clock by 5 ms: no round trip could tell.
+        operators.fetch_add(5_000_000, Ordering::Relaxed);
+        assert!(pair.wait_for(0.5, |r| r.state == RobotState::Holding).await);
+        let cause = pair.robot.reports().last().map(|r| r.cause);
+        assert_eq!(cause, Some(Cause::ClockStep));
+        operators.fetch_sub(5_000_000, Ordering::Relaxed);
+        pair.run_for(1.0).await;
+        operator.quit();
+        operator.done.await.unwrap().0.unwrap();
+        pair.run_for(0.5).await;
+        let (error_s, bound_s, origin) = clock_error(&pair);
+        assert_eq!(origin, Origin::Disciplined);
+        assert!(
+            error_s.abs() < 1e-3 && bound_s < 1e-3,
+            "{error_s} ± {bound_s}"
+        );
     })
     .unwrap();
 }

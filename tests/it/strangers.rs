@@ -248,3 +248,41 @@ fn a_new_session_is_told_at_once_that_the_arm_holds() {
     })
     .unwrap();
 }
+
+#[test]
+fn what_somebody_on_the_way_replays_moves_nothing() {
+    run_virtual(async {
+        let mut pair = Pair::start(&rig()).unwrap();
+        pair.network.record();
+        let operator = mirroring(&mut pair, &delayed(0.05), 41);
+        assert!(
+            pair.wait_for(10.0, |r| r.state == RobotState::Engaged)
+                .await
+        );
+        pair.run_for(1.0).await;
+        // All of a living session, its handshake and its motions: QUIC takes no packet twice.
+        assert!(pair.network.replay() > 50);
+        pair.network.record();
+        let (summary, _, _) = finish(operator).await;
+        let summary = summary.unwrap();
+        assert_eq!((summary.outcome, summary.sessions), (Outcome::Completed, 1));
+        let dropped = pair.robot.notices().iter().find_map(|n| match n {
+            RobotNotice::Disconnected { counters, .. } => Some(counters.dropped),
+            _ => None,
+        });
+        assert_eq!(dropped, Some(0), "the session has seen none of it");
+
+        // All of a session that is over, to a robot at rest that serves another one.
+        let endpoint = pair.stranger(&delayed(0.02), 42).unwrap();
+        let (_connection, _control, _) = greet(&endpoint, &pair, &hello(VERSION, VERSION)).await;
+        pair.run_for(1.0).await;
+        let since = pair.now();
+        assert!(pair.network.replay() > 50);
+        pair.run_for(3.0).await;
+        let reports = pair.robot.reports();
+        let after = reports.iter().filter(|r| r.at >= since);
+        let still = |r: &Report| r.state == RobotState::Ready && !r.moving;
+        assert!(after.clone().count() > 2000 && after.clone().all(still));
+    })
+    .unwrap();
+}
