@@ -290,15 +290,17 @@ impl Daemon {
             hello,
         } = greeted;
         let now = self.clock.now();
-        let half_open = active.as_mut().is_some_and(|held| {
-            held.listen(now);
-            held.key == key && now.secs_since(held.heard.1) >= HALF_OPEN_S
-        });
+        let agreed = negotiate(&hello, v1::VERSION, v1::VERSION);
+        let half_open = agreed.is_some()
+            && active.as_mut().is_some_and(|held| {
+                held.listen(now);
+                held.key == key && now.secs_since(held.heard.1) >= HALF_OPEN_S
+            });
         if half_open {
             let why = (CLOSED, "its operator has come back");
             self.end(active, skill, why, notices);
         }
-        let refusal = match negotiate(&hello, v1::VERSION, v1::VERSION) {
+        let refusal = match agreed {
             None => Some((
                 RejectCode::Version,
                 Reason::Version,

@@ -138,6 +138,45 @@ fn news_is_back_two_round_trips_and_a_redial_after_the_link() {
 }
 
 #[test]
+fn a_link_that_is_dead_one_way_only_is_back_as_soon() {
+    for (seed, rtt_s) in [(40, 0.1), (42, 0.6)] {
+        for up in [true, false] {
+            run_virtual(async {
+                let mut pair = Pair::start(&rig()).unwrap();
+                let link = delayed(rtt_s / 2.0);
+                let mut operator = operator(&mut pair, &link, seed);
+                assert!(
+                    pair.wait_for(20.0, |r| r.state == RobotState::Engaged)
+                        .await
+                );
+                let (ours, robot) = (operator.addr, pair.robot_addr());
+                let (from, to) = if up { (ours, robot) } else { (robot, ours) };
+                let dead = LinkConfig {
+                    loss: 1.0,
+                    ..link.clone()
+                };
+                pair.network.link(from, to, dead, seed);
+                pair.run_for(8.0).await;
+                pair.network.link(from, to, link.clone(), seed);
+                let mut heard = Heard::default();
+                hear(&mut operator, &mut heard);
+                let took = heard_again(&pair, &mut operator, &mut heard, 30.0).await;
+                println!(
+                    "RTT {rtt_s} s, dead {}: {took:?}",
+                    if up { "up" } else { "down" }
+                );
+                let most = 2.0 * rtt_s + REDIAL_S + 0.05 + SLACK_S;
+                assert!(
+                    took.is_some_and(|t| t <= most),
+                    "RTT {rtt_s} s, up {up}: {took:?}"
+                );
+            })
+            .unwrap();
+        }
+    }
+}
+
+#[test]
 fn a_link_that_comes_back_slower_is_reached_by_the_patient_attempts() {
     run_virtual(async {
         let mut pair = Pair::start(&rig()).unwrap();

@@ -22,6 +22,21 @@ const KNOTS_PER_MESSAGE: usize = 24;
 /// More unacknowledged knots than this go by the stream at once: nothing of the path is ever given up.
 const BACKLOG: usize = 256;
 
+/// Every so many messages the robot's prediction is checked against ours.
+const KEYFRAME: u32 = 8;
+
+/// A future bound below this makes no sense: the state itself is quantised, m.
+const LEAST_FUTURE_BOUND_M: f64 = 1e-3;
+
+/// The same for orientations, rad.
+const LEAST_FUTURE_BOUND_RAD: f64 = 5e-3;
+
+/// Where the future's bound is a distance, an orientation may be off by this multiple of its deviation.
+const TURN_SIGMAS: f64 = 0.6;
+
+/// A gripper is told of changes above this, in steps of 1/255.
+const GRIP_STEPS: u8 = 4;
+
 /// Every knot travels in this many messages at once, so that a lost packet costs no round trip …
 const COPIES: u8 = 2;
 
