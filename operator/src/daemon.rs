@@ -18,12 +18,15 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::hello::RejectCode;
 use tokio::sync::{mpsc, watch};
-use tokio::time::sleep_until;
+use tokio::time::{sleep_until, timeout};
 
 use crate::dial::{DialError, Dialler, Link};
 use crate::recognise::Recogniser;
 use crate::session::{Counters, Event, Output, Session, SessionConfig};
 use crate::task::{Advice, Outcome, Task};
+
+/// A robot that has ended its stream gets this long to say why.
+const LAST_WORDS: Duration = Duration::from_millis(500);
 
 /// What the daemon needs.
 #[derive(Debug)]
@@ -397,8 +400,8 @@ impl Daemon {
                             return End::Lost(malformed(&link.connection, &e));
                         }
                     }
-                    Some(Err(e)) => return End::Lost(e.to_string()),
-                    None => return End::Lost("control stream ended".into()),
+                    Some(Err(e)) => return End::Lost(last_words(&link.connection, e.to_string()).await),
+                    None => return End::Lost(last_words(&link.connection, "control stream ended".into()).await),
                 },
                 datagram = link.connection.read_datagram() => match datagram {
                     Ok(bytes) => {
@@ -460,6 +463,12 @@ impl Daemon {
         connection.close(VarInt::from_u32(0), b"goodbye");
         End::Finished
     }
+}
+
+/// A robot that ends a session ends its stream first, and says why when it closes.
+async fn last_words(connection: &Connection, otherwise: String) -> String {
+    let closed = timeout(LAST_WORDS, connection.closed()).await;
+    closed.map_or(otherwise, |why| quic::explain(&why))
 }
 
 fn malformed(connection: &Connection, error: &DecodeError) -> String {

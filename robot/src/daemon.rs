@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use quinn::{Connection, Endpoint, Incoming, VarInt};
+use quinn::{Connection, ConnectionError, Endpoint, Incoming, VarInt};
 use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::{External, Fingerprint, HostClock, Mono, Standing, Trust, quic, trust};
@@ -48,6 +48,9 @@ const MAX_GREETING: usize = 8;
 /// An operator that comes back takes its own old session's place once that has been silent for two keep-alives:
 /// its connection is dead, and only its time-out does not know yet.
 const HALF_OPEN_S: f64 = 2.0 * quic::KEEP_ALIVE.as_millis() as f64 * 1e-3;
+
+/// An operator's longest attempt to connect.
+const OVERLAP_S: f64 = 10.0;
 
 /// What the daemon needs.
 #[derive(Debug)]
@@ -117,12 +120,15 @@ enum Arrival {
     Pairing(Connection),
     /// Turned away already.
     Refused(std::net::SocketAddr, Reason, String),
+    /// It went by itself before it had said anything: an attempt that overlapped with a better one, or a dead link.
+    Gone,
 }
 
 struct Active {
     session: Session,
     connection: Connection,
     key: Fingerprint,
+    began: Mono,
     /// Packets received, and when that last changed.
     heard: (u64, Mono),
     writer: Writer,
@@ -244,6 +250,7 @@ impl Daemon {
                             (!taken).then(|| (peer, Reason::NoWindow, "no pairing window is open for it".to_owned()))
                         }
                         Arrival::Refused(peer, reason, why) => Some((peer, reason, why)),
+                        Arrival::Gone => None,
                     };
                     let told = refused.and_then(|(peer, reason, why)| self.refused.count(peer, reason, why));
                     told.map(|refused| notices.send(Notice::Refused(refused)));
@@ -320,9 +327,14 @@ impl Daemon {
         };
         let peer = connection.remote_address();
         if let Some((code, reason, text)) = refusal {
-            let refused = (peer, reason, text.clone());
+            // Attempts of one operator overlap: those that were under way when it was let in are no news.
+            let own = active.as_ref().is_some_and(|held| {
+                let overlaps = now.secs_since(held.began) < OVERLAP_S;
+                overlaps && held.key == key && held.connection.remote_address() == peer
+            });
+            let refused = (!own).then(|| (peer, reason, text.clone()));
             tokio::spawn(turn_away(connection, control, code, text));
-            return Some(refused);
+            return refused;
         }
         *epoch += 1;
         let ack = Answer::Ack {
@@ -338,6 +350,7 @@ impl Daemon {
             session,
             connection,
             key,
+            began: now,
             heard: (0, now),
             writer,
             frames,
@@ -525,15 +538,19 @@ async fn arrive(
 }
 
 async fn greet(incoming: Incoming, trust: &Trust) -> Result<Arrival, (Reason, String)> {
-    let connection = incoming.await.map_err(|e| {
-        let reason = match quic::refusal(&e) {
-            Some(quic::Refusal::KeyUnknown) => Reason::UnknownKey,
-            Some(quic::Refusal::KeyRevoked) => Reason::RevokedKey,
-            Some(quic::Refusal::Version) => Reason::Version,
-            _ => Reason::Handshake,
-        };
-        (reason, quic::explain(&e))
-    })?;
+    let connection = match incoming.await {
+        Ok(connection) => connection,
+        Err(e) => {
+            let reason = match (quic::refusal(&e), &e) {
+                (Some(quic::Refusal::KeyUnknown), _) => Reason::UnknownKey,
+                (Some(quic::Refusal::KeyRevoked), _) => Reason::RevokedKey,
+                (Some(quic::Refusal::Version), _) => Reason::Version,
+                (Some(_), _) | (None, ConnectionError::TransportError(_)) => Reason::Handshake,
+                (None, _) => return Ok(Arrival::Gone),
+            };
+            return Err((reason, quic::explain(&e)));
+        }
+    };
     if quic::alpn(&connection).as_deref() == Some(pair::ALPN) {
         return Ok(Arrival::Pairing(connection));
     }
@@ -545,8 +562,11 @@ async fn greet(incoming: Incoming, trust: &Trust) -> Result<Arrival, (Reason, St
         connection.close(VarInt::from_u32(NOT_TRUSTED), why.as_bytes());
         return Err((reason, why.to_owned()));
     };
-    let ungreeted = |e: ControlError| (Reason::Greeting, e.to_string());
-    let mut control = Control::accept(&connection).await.map_err(ungreeted)?;
+    let mut control = match Control::accept(&connection).await {
+        Ok(control) => control,
+        Err(ControlError::Connection(_)) => return Ok(Arrival::Gone),
+        Err(e) => return Err((Reason::Greeting, e.to_string())),
+    };
     match control.hello().await {
         Ok(hello) => Ok(Arrival::Greeted(Box::new(Greeted {
             connection,
@@ -554,6 +574,7 @@ async fn greet(incoming: Incoming, trust: &Trust) -> Result<Arrival, (Reason, St
             control,
             hello,
         }))),
+        Err(ControlError::Connection(_) | ControlError::Stream(_)) => Ok(Arrival::Gone),
         Err(e) => {
             let text = e.to_string();
             turn_away(connection, control, RejectCode::Malformed, text.clone()).await;
