@@ -343,11 +343,11 @@ fn two_hosts_pair_drive_by_name_and_part_by_revocation() {
         ])
     };
     let operator = start();
+    operator.event("engaged");
     // One host, one clock: both ends' wall clocks are the same to the nanosecond.
     operator.event_where("telemetry", |e| {
         e["clock_uncertainty_ms"].as_f64().unwrap() < 0.2
     });
-    operator.event("engaged");
     let revoke = Process::start(&["peers", "revoke", "laptop", "--file", &robots, "--json"]);
     assert!(revoke.end().0.success());
     let ended = robot.event("disconnected");

@@ -182,6 +182,34 @@ fn a_link_that_is_dead_one_way_only_is_back_as_soon() {
 }
 
 #[test]
+fn a_thin_link_is_not_drowned_by_attempts() {
+    run_virtual(async {
+        let thin = LinkConfig {
+            rate_bit_s: Some(64e3),
+            ..delayed(0.05)
+        };
+        let mut pair = Pair::start(&rig()).unwrap();
+        let mut operator = operator(&mut pair, &thin, 30);
+        assert!(
+            pair.wait_for(30.0, |r| r.state == RobotState::Engaged)
+                .await
+        );
+        pair.network.set_down(true);
+        pair.run_for(5.0).await;
+        pair.network.set_down(false);
+        let mut heard = Heard::default();
+        hear(&mut operator, &mut heard);
+        let took = heard_again(&pair, &mut operator, &mut heard, true).await;
+        println!("64 kbit/s: {took:?}");
+        assert!(took.is_some_and(|t| t < 3.0), "{took:?}");
+        pair.run_for(5.0).await;
+        hear(&mut operator, &mut heard);
+        assert_eq!(heard.sessions, 2, "and it lasts");
+    })
+    .unwrap();
+}
+
+#[test]
 fn a_link_that_comes_back_slower_is_reached_by_the_patient_attempts() {
     run_virtual(async {
         let mut pair = Pair::start(&rig()).unwrap();
