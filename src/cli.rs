@@ -51,11 +51,8 @@ enum Command {
     Operator(Box<telemime_operator::cli::Args>),
     /// The robot daemon: an arm that follows.
     Robot(telemime_robot::cli::Args),
-    /// Show this host's key by its fingerprint; make it if there is none.
     Identity(admin::IdentityArgs),
-    /// Pair with a robot that has a pairing window open.
     Pair(telemime_operator::cli::PairArgs),
-    /// List whom this host trusts; add, revoke, remove.
     Peers(admin::PeersArgs),
     /// A UDP relay that delays, loses and throttles what passes.
     Link(LinkArgs),

@@ -23,11 +23,8 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Show this host's key by its fingerprint; make it if there is none.
     Identity(admin::IdentityArgs),
-    /// List whom this host trusts; add, revoke, remove.
     Peers(admin::PeersArgs),
-    /// Pair with a robot that has a pairing window open.
     Pair(telemime_operator::cli::PairArgs),
 }
 

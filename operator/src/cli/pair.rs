@@ -14,7 +14,7 @@ use telemime_protocol::wire::pair::AbortCode;
 use tokio::sync::oneshot;
 use tokio::time::timeout;
 
-/// Pair with a robot that has a pairing window open: both ends come to trust each other's keys.
+/// Pair with a robot that has a pairing window open.
 ///
 /// Both ends show a code of eight digits, made of both keys and this very connection; somebody in between would
 /// make them differ. Compare them, and say yes at both ends; only then is anything stored. The window is opened at
@@ -100,8 +100,8 @@ async fn paired(args: &PairArgs) -> anyhow::Result<()> {
         pairing::offer(&connection, &own).await
     };
     let patience = Duration::from_secs_f64(args.patience);
-    let offered = timeout(patience, connecting).await.with_context(|| {
-        format!("no answer from {robot}: is the robot running, and does UDP reach it?")
+    let offered = timeout(patience, connecting).await.map_err(|_| {
+        anyhow::anyhow!("no answer from {robot}: is the robot running, and does UDP reach it?")
     })??;
     let shown = offered.candidate.clone();
     let name = alias.unwrap_or_else(|| shown.name.clone());
