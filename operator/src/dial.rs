@@ -2,18 +2,19 @@
 //!
 //! A link that has just come back carries a *fresh* attempt at once, while an older one waits for a retransmission
 //! that QUIC has put off further and further. So attempts begin at a steady pace and overlap; the first of
-//! them that the robot greets is the session, and the others are dropped.
+//! them that the robot greets is the session, and the others are dropped. Once a robot has answered one of them at
+//! all, no further ones begin for a while: on a thin link they would only stand in its way.
 
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use quinn::{Connection, Endpoint};
+use quinn::{Connecting, Connection, Endpoint};
 use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::quic::{self, Refusal};
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::v1;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until, timeout};
 
@@ -23,6 +24,10 @@ pub const REDIAL: Duration = Duration::from_millis(250);
 /// An attempt is given at least this long, and at least this many of the round trips last seen.
 const LEAST_ATTEMPT: Duration = Duration::from_millis(500);
 const ROUND_TRIPS: u32 = 4;
+
+/// No further attempt begins for so long after a robot has answered one: the link is there, and the handshake has all of
+/// it. Should it die again, the next attempt is no later than this.
+const UNDISTURBED: Duration = Duration::from_secs(2);
 
 /// The longest time-out of an attempt.
 const LONGEST_ATTEMPT: Duration = Duration::from_secs(10);
@@ -85,6 +90,7 @@ pub(crate) struct Dialler {
     pace: Pace,
     attempts: JoinSet<(bool, Result<Link, DialError>)>,
     patient: bool,
+    answered_tx: watch::Sender<Option<Instant>>,
     next: Instant,
 }
 
@@ -97,6 +103,7 @@ impl Dialler {
             pace: Pace::new(rtt),
             attempts: JoinSet::new(),
             patient: false,
+            answered_tx: watch::Sender::new(None),
             next: Instant::now(),
         }
     }
@@ -114,24 +121,42 @@ impl Dialler {
                 Some(outcome)
             }
             () = sleep_until(self.next) => {
-                self.next = Instant::now() + REDIAL;
+                let now = Instant::now();
+                self.next = now + REDIAL;
+                let answered = *self.answered_tx.borrow();
+                if !self.attempts.is_empty() && answered.is_some_and(|at| now < at + UNDISTURBED) {
+                    return None;
+                }
                 let patient = !std::mem::replace(&mut self.patient, true);
                 let within = if patient { self.pace.next_patient() } else { self.pace.brisk };
-                let connecting = connect(self.endpoint.clone(), self.robot);
-                self.attempts.spawn(async move {
-                    let silent = || Err(DialError::Again("no answer: is the robot running, and does UDP reach it?".into()));
-                    (patient, timeout(within, connecting).await.unwrap_or_else(|_| silent()))
-                });
+                let attempt = attempt(self.endpoint.clone(), self.robot, within, self.answered_tx.clone());
+                self.attempts.spawn(async move { (patient, attempt.await) });
                 None
             }
         }
     }
 }
 
-async fn connect(endpoint: Endpoint, robot: SocketAddr) -> Result<Link, DialError> {
-    let connecting = endpoint
+/// An attempt is given `within` to be answered at all, and then as long as the longest.
+async fn attempt(
+    endpoint: Endpoint,
+    robot: SocketAddr,
+    within: Duration,
+    answered: watch::Sender<Option<Instant>>,
+) -> Result<Link, DialError> {
+    let mut connecting = endpoint
         .connect(robot, "telemime")
         .map_err(|e| DialError::Again(e.to_string()))?;
+    let silent =
+        |_| DialError::Again("no answer: is the robot running, and does UDP reach it?".to_owned());
+    let answer = timeout(within, connecting.handshake_data()).await;
+    answer.map_err(silent)?.map_err(|e| failed(&e))?;
+    answered.send_replace(Some(Instant::now()));
+    let rest = timeout(LONGEST_ATTEMPT, connect(connecting)).await;
+    rest.map_err(silent)?
+}
+
+async fn connect(connecting: Connecting) -> Result<Link, DialError> {
     let connection = connecting.await.map_err(|e| failed(&e))?;
     // With TLS 1.3 the handshake seems complete before the server has looked at our key.
     let again = |e: ControlError| match &e {
