@@ -118,6 +118,10 @@ impl Dialler {
                 if patient {
                     self.patient = false;
                 }
+                if outcome.is_err() {
+                    // What was left undisturbed has failed: on with the others.
+                    self.answered_tx.send_replace(None);
+                }
                 Some(outcome)
             }
             () = sleep_until(self.next) => {

@@ -5,16 +5,20 @@
 //! [`TurnState`], [`TurnModel`] and [`TurnForecast`] are the same for its orientation.
 
 mod ahead;
+mod experts;
 mod forecast;
 mod model;
+mod params;
 mod state;
 mod turn;
 
 pub use ahead::{Ahead, Knot, Way};
-pub use forecast::{Forecast, Params, ParamsError, Prediction};
+pub use experts::{Experts, Generic};
+pub use forecast::{Forecast, Prediction};
 pub use model::{
     BLOCK, Calibration, Model, ModelError, Posterior, Regression, Standardisation, TARGETS, TEMPER,
 };
+pub use params::{BAND_KNOTS, Params, ParamsError, WEIGHTED};
 pub use state::{FEATURES, HandState, MEMORY_TAU_S};
 pub use turn::{TurnForecast, TurnModel, TurnPrediction, TurnState, checksum};
 

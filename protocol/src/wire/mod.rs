@@ -6,6 +6,7 @@ pub mod frame;
 pub mod hello;
 pub mod knots;
 pub mod pair;
+mod params;
 pub mod state;
 pub mod turn;
 pub mod v1;
