@@ -20,7 +20,7 @@ use telemime_protocol::wire::hello::RejectCode;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{sleep_until, timeout};
 
-use crate::dial::{DialError, Dialler, Link};
+use crate::dial::{DialError, Dialler, Link, Seen};
 use crate::recognise::Recogniser;
 use crate::session::{Counters, Event, Output, Session, SessionConfig};
 use crate::task::{Advice, Outcome, Task};
@@ -211,7 +211,7 @@ impl Daemon {
         let mut marks = Marks::default();
         // Demanded, and not confirmed by the robot: outlives the session it was demanded in.
         let mut stop = false;
-        let mut rtt = None;
+        let mut seen = None;
         loop {
             let mut hung_up = quit.clone();
             let mut console = Console {
@@ -222,10 +222,10 @@ impl Daemon {
             let link = tokio::select! {
                 biased;
                 () = told(&mut hung_up) => break,
-                link = self.dial(rtt, task, &mut console, &mut stop) => link?,
+                link = self.dial(seen, task, &mut console, &mut stop) => link?,
             };
             let Some(link) = link else { break };
-            let connection = link.connection.clone();
+            let (mut last, connection) = (link.seen(), link.connection.clone());
             summary.sessions += 1;
             let _ = notices.send(Notice::Connected { epoch: link.epoch });
             let mut session = Session::new(self.config, self.skill.clone(), link.epoch)
@@ -237,8 +237,9 @@ impl Daemon {
             let end = self
                 .drive(&mut session, link, task, console, &mut marks)
                 .await;
-            rtt = Some(connection.rtt());
+            last.rtt = connection.rtt();
             drop(connection);
+            seen = Some(last);
             stop = session.stop_is_unconfirmed();
             summary.counters.add(session.counters());
             match end {
@@ -271,16 +272,16 @@ impl Daemon {
     }
 
     /// Dials until there is a session; `None` once the task is over anyway and no `stop` has to be delivered.
-    /// `rtt` is the last session's round trip, if there was one.
+    /// `seen` is what the last session's link was like, if there was one.
     async fn dial(
         &self,
-        rtt: Option<Duration>,
+        seen: Option<Seen>,
         task: &Task,
         console: &mut Console<'_>,
         stop: &mut bool,
     ) -> Result<Option<Link>, DaemonError> {
-        let (begun, first, addr) = (self.now(), rtt.is_none(), self.robot);
-        let mut dialler = Dialler::new(&self.endpoint, addr, rtt);
+        let (begun, first, addr) = (self.now(), seen.is_none(), self.robot);
+        let mut dialler = Dialler::new(&self.endpoint, addr, seen);
         let mut said = None;
         loop {
             let outcome = console.beside(stop, dialler.next()).await;

@@ -21,6 +21,12 @@ use tokio::time::{Instant, sleep_until, timeout};
 /// Attempts begin this far apart.
 pub const REDIAL: Duration = Duration::from_millis(250);
 
+/// Attempts begin this many times as far apart as the first packets' own length took on the last link, if that is
+/// more; but no farther than [`SLOWEST_REDIAL`]. Each is two packets of 1.2 kB: on 64 kbit/s, four a second would fill a
+/// queue for ever.
+const LENGTHS: u32 = 3;
+const SLOWEST_REDIAL: Duration = Duration::from_secs(1);
+
 /// An attempt is given at least this long, and at least this many of the round trips last seen.
 const LEAST_ATTEMPT: Duration = Duration::from_millis(500);
 const ROUND_TRIPS: u32 = 4;
@@ -41,6 +47,25 @@ pub(crate) struct Link {
     pub(crate) writer: Writer,
     pub(crate) frames: mpsc::Receiver<Result<Frame, ControlError>>,
     pub(crate) epoch: u32,
+    /// From the first packet to the answer; more than the round trip by what their lengths take.
+    answered: Duration,
+}
+
+impl Link {
+    /// What is to be known of the link, once it is lost.
+    pub(crate) fn seen(&self) -> Seen {
+        Seen {
+            rtt: self.connection.rtt(),
+            answered: self.answered,
+        }
+    }
+}
+
+/// What the last link was like.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Seen {
+    pub(crate) rtt: Duration,
+    answered: Duration,
 }
 
 /// Why an attempt did not become a session.
@@ -63,15 +88,20 @@ pub(crate) enum DialError {
 /// were, forty of them would be retransmitting after a longer outage.
 #[derive(Debug, Clone, Copy)]
 struct Pace {
+    apart: Duration,
     brisk: Duration,
     patient: Duration,
 }
 
 impl Pace {
-    fn new(rtt: Option<Duration>) -> Self {
-        let brisk = rtt.map_or(LEAST_ATTEMPT, |rtt| rtt * ROUND_TRIPS);
+    fn new(seen: Option<Seen>) -> Self {
+        let (brisk, lengths) = seen.map_or((LEAST_ATTEMPT, Duration::ZERO), |seen| {
+            let lengths = seen.answered.saturating_sub(seen.rtt);
+            (seen.rtt * ROUND_TRIPS + lengths, lengths)
+        });
         let brisk = brisk.clamp(LEAST_ATTEMPT, LONGEST_ATTEMPT);
         Self {
+            apart: (lengths * LENGTHS).clamp(REDIAL, SLOWEST_REDIAL),
             brisk,
             patient: brisk,
         }
@@ -95,12 +125,12 @@ pub(crate) struct Dialler {
 }
 
 impl Dialler {
-    /// Begins with the first poll of [`Dialler::next`]; `rtt` is the round trip last seen.
-    pub(crate) fn new(endpoint: &Endpoint, robot: SocketAddr, rtt: Option<Duration>) -> Self {
+    /// Begins with the first poll of [`Dialler::next`]; `seen` is what the last link was like.
+    pub(crate) fn new(endpoint: &Endpoint, robot: SocketAddr, seen: Option<Seen>) -> Self {
         Self {
             endpoint: endpoint.clone(),
             robot,
-            pace: Pace::new(rtt),
+            pace: Pace::new(seen),
             attempts: JoinSet::new(),
             patient: false,
             answered_tx: watch::Sender::new(None),
@@ -126,7 +156,7 @@ impl Dialler {
             }
             () = sleep_until(self.next) => {
                 let now = Instant::now();
-                self.next = now + REDIAL;
+                self.next = now + self.pace.apart;
                 let answered = *self.answered_tx.borrow();
                 if !self.attempts.is_empty() && answered.is_some_and(|at| now < at + UNDISTURBED) {
                     return None;
@@ -148,6 +178,7 @@ async fn attempt(
     within: Duration,
     answered: watch::Sender<Option<Instant>>,
 ) -> Result<Link, DialError> {
+    let begun = Instant::now();
     let mut connecting = endpoint
         .connect(robot, "telemime")
         .map_err(|e| DialError::Again(e.to_string()))?;
@@ -155,12 +186,13 @@ async fn attempt(
         |_| DialError::Again("no answer: is the robot running, and does UDP reach it?".to_owned());
     let answer = timeout(within, connecting.handshake_data()).await;
     answer.map_err(silent)?.map_err(|e| failed(&e))?;
-    answered.send_replace(Some(Instant::now()));
-    let rest = timeout(LONGEST_ATTEMPT, connect(connecting)).await;
+    let now = Instant::now();
+    answered.send_replace(Some(now));
+    let rest = timeout(LONGEST_ATTEMPT, connect(connecting, now - begun)).await;
     rest.map_err(silent)?
 }
 
-async fn connect(connecting: Connecting) -> Result<Link, DialError> {
+async fn connect(connecting: Connecting, answered: Duration) -> Result<Link, DialError> {
     let connection = connecting.await.map_err(|e| failed(&e))?;
     // With TLS 1.3 the handshake seems complete before the server has looked at our key.
     let again = |e: ControlError| match &e {
@@ -188,6 +220,7 @@ async fn connect(connecting: Connecting) -> Result<Link, DialError> {
                 writer,
                 frames,
                 epoch,
+                answered,
             })
         }
         Answer::Ack { version, .. } => Err(DialError::Rejected {
@@ -224,10 +257,15 @@ mod tests {
             (None, 500),
             (Some(20), 500),
             (Some(125), 500),
-            (Some(600), 2400),
+            (Some(600), 2420),
             (Some(60_000), 10_000),
         ] {
-            let mut pace = Pace::new(rtt.map(ms));
+            let seen = |rtt| Seen {
+                rtt: ms(rtt),
+                answered: ms(rtt + 20),
+            };
+            let mut pace = Pace::new(rtt.map(seen));
+            assert_eq!(pace.apart, REDIAL, "{rtt:?}");
             assert_eq!(pace.brisk, ms(brisk), "{rtt:?}");
             let mut due = brisk;
             for _ in 0..8 {
@@ -235,6 +273,18 @@ mod tests {
                 assert_eq!(pace.next_patient(), ms(due));
             }
             assert_eq!(due, 10_000);
+        }
+    }
+
+    #[test]
+    fn on_a_thin_link_attempts_are_farther_apart() {
+        let ms = Duration::from_millis;
+        for (answered, apart) in [(180, 250), (300, 600), (3_000, 1_000)] {
+            let seen = Seen {
+                rtt: ms(100),
+                answered: ms(answered),
+            };
+            assert_eq!(Pace::new(Some(seen)).apart, ms(apart));
         }
     }
 }
