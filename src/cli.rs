@@ -12,7 +12,7 @@ use telemime_endpoint::{HostClock, admin};
 use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
 
 use crate::relay::{Passage, Relay, RelayConfig};
-use crate::{codec, demo, ingest, paper, recognise, select, teach};
+use crate::{codec, demo, evaluate, ingest, paper, recognise, select, tap, teach};
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
 /// network delay behind it.
@@ -45,6 +45,8 @@ enum Command {
     Confusion(recognise::ConfusionArgs),
     /// Compare mixtures for a folder of demonstrations: kinds, numbers of components, criteria.
     Select(select::Args),
+    /// How well motion is predicted: every recording by skills that were learned without it.
+    Evaluate(evaluate::Args),
     /// Compress recordings within an error bound, ours beside other ways.
     Codec(codec::Args),
     /// The operator daemon: teach, drive, play.
@@ -54,6 +56,8 @@ enum Command {
     Identity(admin::IdentityArgs),
     Pair(telemime_operator::cli::PairArgs),
     Peers(admin::PeersArgs),
+    /// Measure the input's latency from taps on a table.
+    Tap(tap::Args),
     /// A UDP relay that delays, loses and throttles what passes.
     Link(LinkArgs),
     /// Reproduce the tables of the source publication beside ours.
@@ -121,7 +125,9 @@ pub fn main() -> ExitCode {
         Some(Command::Recognise(args)) => recognise::recognise(args),
         Some(Command::Confusion(args)) => recognise::confusion(args),
         Some(Command::Select(args)) => select::run(args),
+        Some(Command::Evaluate(args)) => evaluate::run(args),
         Some(Command::Codec(args)) => codec::run(args),
+        Some(Command::Tap(args)) => tap::run(args),
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),
         Some(Command::Identity(args)) => admin::identity(args, Role::Operator),
@@ -154,7 +160,7 @@ fn link(args: &LinkArgs) -> anyhow::Result<()> {
         .build()?;
     let (mut passed, mut lost) = (0u64, 0u64);
     let result = runtime.block_on(async {
-        let (quit, _words) = shell::listen(false, "quit?", || {})?;
+        let (quit, _words) = shell::listen(false, "quit", || {})?;
         let config = RelayConfig {
             listen: args.listen,
             to: args.to,

@@ -11,6 +11,7 @@ macro_rules! say {
 pub mod cli;
 mod codec;
 mod demo;
+mod evaluate;
 mod figure;
 pub mod ground;
 mod ingest;
@@ -20,4 +21,5 @@ mod picture;
 mod recognise;
 pub mod relay;
 mod select;
+mod tap;
 mod teach;

@@ -21,7 +21,7 @@ use telemime_endpoint::peers::{Peers, PeersError, Role, Source, Whom};
 use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Mono, Trust, quic};
 use tokio::sync::mpsc;
 
-use crate::daemon::Daemon;
+use crate::daemon::{Daemon, Learning};
 use crate::placed::Placed;
 use crate::session::{FutureBound, SessionConfig};
 use crate::task::{Outcome, Recording, Task};
@@ -35,7 +35,8 @@ pub use skills::Skills;
 ///
 /// Replays a recording as if the hand were there (--replay), or plays a learned skill (--play). The robot must be
 /// known: pair with it once (`telemime pair HOST:PORT`), or give the fingerprint it prints with --peer. On the
-/// terminal, type stop (emergency stop), reset or quit.
+/// terminal, type stop (emergency stop), reset, or quit; keep takes the performance driven last as a demonstration,
+/// refine learns from those kept, and save FILE writes the skill as it is now.
 #[derive(clap::Args, Debug, Clone, Default)]
 pub struct Args {
     /// Read settings from this TOML file; flags override it.
@@ -66,12 +67,15 @@ pub struct Args {
     /// Load a skill that `telemime learn` saved; may be repeated.
     #[arg(long, value_name = "FILE")]
     pub skill: Vec<PathBuf>,
-    /// Save what --learn learned into this folder, one NAME.skill each.
+    /// Save what --learn learned, and what --refine made of it, into this folder, one NAME.skill each.
     #[arg(long, value_name = "DIR")]
     pub save: Option<PathBuf>,
-    /// Replay this recording (CSV: t,x,y,z) in real time, mirrored by the robot.
+    /// Replay this recording (CSV: t,x,y,z) in real time, mirrored by the robot; may be repeated, one after another.
     #[arg(long, value_name = "FILE", conflicts_with = "play")]
-    pub replay: Option<PathBuf>,
+    pub replay: Vec<PathBuf>,
+    /// Replay: refine the skill with every performance, before the next one; --save keeps it.
+    #[arg(long, conflicts_with = "play")]
+    pub refine: bool,
     /// Play this skill: its inferred motion, compressed to checkpoints.
     #[arg(long, value_name = "SKILL")]
     pub play: Option<String>,
@@ -95,6 +99,12 @@ pub struct Args {
     /// The hand's axes [default: kinect].
     #[arg(long, value_enum)]
     pub axes: Option<Axes>,
+    /// How old a sample is when the input hands it over, 0 to 300ms: `telemime tap` measures it [default: 0ms].
+    #[arg(long, value_name = "TIME", value_parser = parse_latency)]
+    pub input_latency: Option<f64>,
+    /// Take every sample as it comes: no sample is replaced that a tracker got wrong for a frame or two.
+    #[arg(long)]
+    pub no_glitch_gate: bool,
     /// Prediction gain, 0 (none) to 1.
     #[arg(long)]
     pub gain: Option<f64>,
@@ -120,6 +130,9 @@ pub struct Args {
     /// Give up if the robot is not reached within this time, s [default: 10].
     #[arg(long, value_name = "S")]
     pub patience: Option<f64>,
+    /// Offer protocol versions up to this one; 2 is an experiment [default: 1].
+    #[arg(long, value_name = "N")]
+    pub protocol_max: Option<u16>,
     /// Seed of learning.
     #[arg(long)]
     pub seed: Option<u64>,
@@ -185,6 +198,46 @@ fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
     }
 }
 
+/// Longest latency of an input, ms: with the network's it must stay below what a robot accepts as fresh.
+const MAX_LATENCY_MS: f64 = 300.0;
+
+fn parse_latency(text: &str) -> Result<f64, String> {
+    let (digits, factor) = match (text.strip_suffix("ms"), text.strip_suffix('s')) {
+        (Some(digits), _) => (digits, 1.0),
+        (None, Some(digits)) => (digits, 1e3),
+        (None, None) => (text, 1.0),
+    };
+    let ms = digits.trim().parse::<f64>().ok().map(|v| v * factor);
+    ms.filter(|ms| (0.0..=MAX_LATENCY_MS).contains(ms))
+        .map(|ms| ms * 1e-3)
+        .ok_or_else(|| format!("`{text}`: write a time from 0 to {MAX_LATENCY_MS} ms (62ms)"))
+}
+
+/// Settings of the input.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Input {
+    latency_ms: Option<f64>,
+    glitch_gate: Option<bool>,
+}
+
+/// One file, or several.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(untagged)]
+enum Files {
+    One(PathBuf),
+    Several(Vec<PathBuf>),
+}
+
+impl From<Files> for Vec<PathBuf> {
+    fn from(files: Files) -> Self {
+        match files {
+            Files::One(file) => vec![file],
+            Files::Several(files) => files,
+        }
+    }
+}
+
 /// The TOML file; every key may be left out.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -200,7 +253,8 @@ struct File {
     matching: Option<String>,
     #[serde(default)]
     skills: Vec<PathBuf>,
-    replay: Option<PathBuf>,
+    replay: Option<Files>,
+    refine: Option<bool>,
     play: Option<String>,
     #[serde(default)]
     frames: BTreeMap<String, Vec<f64>>,
@@ -208,6 +262,8 @@ struct File {
     turn_bound_rad: Option<f64>,
     scale: Option<f64>,
     axes: Option<Axes>,
+    #[serde(default)]
+    input: Input,
     gain: Option<f64>,
     future_bound: Option<String>,
     path_bound_m: Option<f64>,
@@ -216,6 +272,7 @@ struct File {
     lease_s: Option<f64>,
     rest_s: Option<f64>,
     patience_s: Option<f64>,
+    protocol_max: Option<u16>,
     seed: Option<u64>,
 }
 
@@ -249,9 +306,23 @@ impl Args {
             (self.learn, self.skill) = (file.learn, file.skills);
         }
         self.matching = self.matching.or(file.matching);
-        if self.replay.is_none() && self.play.is_none() {
-            (self.replay, self.play) = (file.replay, file.play);
+        if self.replay.is_empty() && self.play.is_none() {
+            self.replay = file.replay.map_or_else(Vec::new, Vec::from);
+            self.play = file.play;
+            // As on the command line: there is nothing to refine by what is only played.
+            self.refine |= file.refine.unwrap_or(false) && self.play.is_none();
         }
+        if let Some(ms) = file
+            .input
+            .latency_ms
+            .filter(|_| self.input_latency.is_none())
+        {
+            let latency = parse_latency(&format!("{ms}ms"));
+            let latency = latency
+                .map_err(|e| anyhow::anyhow!("{}: [input] latency_ms = {e}", path.display()))?;
+            self.input_latency = Some(latency);
+        }
+        self.no_glitch_gate |= file.input.glitch_gate == Some(false);
         if self.frame.is_empty() && self.play.is_some() {
             self.frame = file
                 .frames
@@ -272,6 +343,7 @@ impl Args {
         self.lease = self.lease.or(file.lease_s);
         self.rest = self.rest.or(file.rest_s);
         self.patience = self.patience.or(file.patience_s);
+        self.protocol_max = self.protocol_max.or(file.protocol_max);
         self.seed = self.seed.or(file.seed);
         Ok(self)
     }
@@ -284,9 +356,12 @@ impl Args {
             lease_s: self.lease.unwrap_or(defaults.lease_s),
             future_bound: self.future_bound.unwrap_or(defaults.future_bound),
             path_bound_m: self.path_bound,
+            input_latency_s: self.input_latency.unwrap_or(0.0),
+            glitch_gate: !self.no_glitch_gate,
             gain: self.gain.unwrap_or(defaults.gain),
             scale: self.scale,
             rotation: self.axes.unwrap_or_default().rotation(),
+            versions: telemime_endpoint::cli::versions(self.protocol_max)?,
         };
         let within = |name: &str, value: f64, low: f64, high: f64| -> anyhow::Result<()> {
             if !(value > low && value <= high) {
@@ -367,8 +442,7 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     let skills = Skills::gather(&args, &log)?;
     let (mut task, played) = make_task(&args, &skills, config.rotation, &log)?;
 
-    let help = "stop, reset or quit?";
-    let (quit, words) = cli::listen(args.follow_stdin, help, || {})?;
+    let (quit, words) = cli::listen(args.follow_stdin, cli::OPERATOR_WORDS, || {})?;
     let meter = Meter::default();
     let socket = quic::Socket::bind(any_port(robot))?;
     let endpoint = quic::client(&identity, &trust, socket, &meter)?;
@@ -385,6 +459,10 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         skill: skills.mirror(),
         recogniser: skills.recogniser(&log),
         config,
+        learning: Learning {
+            refine: args.refine,
+            save: args.save.clone(),
+        },
         patience: Duration::from_secs_f64(args.patience.unwrap_or(10.0).clamp(0.1, 3600.0)),
     };
     let (notices, heard) = mpsc::unbounded_channel();
@@ -408,7 +486,7 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     if let Some(scores) = played.and_then(|played| played.scores()) {
         log.say(&scores);
     }
-    log.say(&Event::done(&summary, &task, epoch));
+    log.say(&Event::done(&summary, &task, epoch, config.input_latency_s));
     drop(log);
     printing.finish();
     match summary.outcome {
@@ -475,14 +553,20 @@ fn make_task(
     rotation: UnitQuaternion<f64>,
     log: &report::Log,
 ) -> anyhow::Result<(Task, Option<Played>)> {
-    match (&args.replay, &args.play) {
-        (Some(path), None) => {
-            let recording = skills.unseen(path)?;
-            let samples = recording.samples().to_vec();
+    match (&args.replay[..], &args.play) {
+        ([first, then @ ..], None) => {
             let rest_s = args.rest.unwrap_or(1.0).clamp(0.0, 60.0);
-            Ok((Task::replay(Recording { samples, rest_s }), None))
+            let recording = |path: &PathBuf| -> anyhow::Result<Recording> {
+                let samples = skills.unseen(path)?.samples().to_vec();
+                Ok(Recording { samples, rest_s })
+            };
+            let mut task = Task::replay(recording(first)?);
+            for path in then {
+                task = task.and_then(recording(path)?);
+            }
+            Ok((task, None))
         }
-        (None, Some(name)) => {
+        ([], Some(name)) => {
             let skill = skills.named(name)?;
             let derived = Bounds::of(&skill);
             let bounds = Bounds {

@@ -1,7 +1,9 @@
 //! The operator's shell: dials, redials, feeds the session samples and moves its bytes.
 
+use std::borrow::Cow;
 use std::future::Future;
 use std::net::SocketAddr;
+use std::path::PathBuf;
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -15,12 +17,13 @@ use telemime_endpoint::{
 };
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
-use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::hello::RejectCode;
+use telemime_protocol::wire::{DecodeError, Version};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{sleep_until, timeout};
 
 use crate::dial::{DialError, Dialler, Link, Seen};
+use crate::lessons::{Lesson, LessonError, Lessons};
 use crate::recognise::Recogniser;
 use crate::session::{Counters, Event, Output, Session, SessionConfig};
 use crate::task::{Advice, Outcome, Task};
@@ -51,8 +54,19 @@ pub struct Daemon {
     pub recogniser: Option<Recogniser>,
     /// Session settings.
     pub config: SessionConfig,
+    /// What is learned from while driving, unasked.
+    pub learning: Learning,
     /// Give up if the first connection takes longer than this.
     pub patience: Duration,
+}
+
+/// What a daemon learns from while driving without being told to.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Learning {
+    /// Refines the skill with every performance of the task, before the next one.
+    pub refine: bool,
+    /// Saves the refined skill into this folder.
+    pub save: Option<PathBuf>,
 }
 
 /// Why the daemon ended without doing its task.
@@ -125,6 +139,8 @@ pub enum Notice {
     Connected {
         /// Its epoch.
         epoch: u32,
+        /// The protocol version both speak.
+        version: Version,
     },
     /// The connection was lost.
     Lost {
@@ -136,7 +152,25 @@ pub enum Notice {
     /// How far the task has got, in [0, 1]; a few times a second.
     Progress(f64),
     /// What became of something the person at the terminal said.
-    Note(&'static str),
+    Note(Cow<'static, str>),
+    /// A performance of the task is over, and its recording's time was 0 then.
+    Performed {
+        /// Which one, from 1 on.
+        number: u32,
+        /// When, on the session clock, the recording's first sample was valid.
+        zero: Stamp,
+    },
+    /// A performance was kept, by this name.
+    Kept(String),
+    /// The skill was refined.
+    Refined {
+        /// It.
+        skill: Arc<Skill>,
+        /// The performance, and the share of it that was new to the skill.
+        learned: Vec<(String, f64)>,
+    },
+    /// The skill was written to this file.
+    Saved(PathBuf),
     /// The scale the next engagement uses, and ε_path, m.
     Mapping {
         /// Tip metres per hand metre.
@@ -172,14 +206,17 @@ impl Console<'_> {
                     }
                     Word::Reset => "there is no link: the reset is discarded",
                     Word::Pair(_) | Word::Yes | Word::No => NOT_HERE,
+                    Word::Keep | Word::Refine | Word::Save(_) => {
+                        "there is no link: say it again when it is back"
+                    }
                 }),
                 done = &mut work => return done,
             }
         }
     }
 
-    fn note(&self, text: &'static str) {
-        let _ = self.notices.send(Notice::Note(text));
+    fn note(&self, text: impl Into<Cow<'static, str>>) {
+        let _ = self.notices.send(Notice::Note(text.into()));
     }
 }
 
@@ -209,6 +246,7 @@ impl Daemon {
             sessions: 0,
         };
         let mut marks = Marks::default();
+        let mut lessons = Lessons::new(self.skill.clone());
         // Demanded, and not confirmed by the robot: outlives the session it was demanded in.
         let mut stop = false;
         let mut seen = None;
@@ -227,15 +265,19 @@ impl Daemon {
             let Some(link) = link else { break };
             let (mut last, connection) = (link.seen(), link.connection.clone());
             summary.sessions += 1;
-            let _ = notices.send(Notice::Connected { epoch: link.epoch });
-            let mut session = Session::new(self.config, self.skill.clone(), link.epoch)
+            let _ = notices.send(Notice::Connected {
+                epoch: link.epoch,
+                version: link.version,
+            });
+            let mut session = Session::new(self.config, lessons.skill(), link.epoch)
+                .speaking(link.version)
                 .watched_by(self.recogniser.clone());
             marks.requests = 0;
             if stop {
                 session.stop(self.now());
             }
             let end = self
-                .drive(&mut session, link, task, console, &mut marks)
+                .drive(&mut session, link, task, console, &mut marks, &mut lessons)
                 .await;
             last.rtt = connection.rtt();
             drop(connection);
@@ -249,6 +291,10 @@ impl Daemon {
                     let _ = notices.send(Notice::Lost { why });
                 }
             }
+        }
+        if lessons.is_busy() {
+            let lesson = lessons.finished().await;
+            self.learned(lesson, &lessons, notices);
         }
         self.endpoint.wait_idle().await;
         summary.outcome = task.outcome(*quit.borrow());
@@ -281,7 +327,7 @@ impl Daemon {
         stop: &mut bool,
     ) -> Result<Option<Link>, DaemonError> {
         let (begun, first, addr) = (self.now(), seen.is_none(), self.robot);
-        let mut dialler = Dialler::new(&self.endpoint, addr, seen);
+        let mut dialler = Dialler::new(&self.endpoint, addr, self.config.versions, seen);
         let mut said = None;
         loop {
             let outcome = console.beside(stop, dialler.next()).await;
@@ -332,6 +378,7 @@ impl Daemon {
         task: &mut Task,
         console: Console<'_>,
         marks: &mut Marks,
+        lessons: &mut Lessons,
     ) -> End {
         let notices = console.notices;
         let key = trust::key_of(&link.connection);
@@ -360,6 +407,26 @@ impl Daemon {
                 let _ = notices.send(Notice::Event(now, event));
             }
             let advice = task.advise(now, session);
+            if advice == Advice::Performed {
+                marks.performances += 1;
+                let zero = task.zero().unwrap_or(now);
+                let _ = notices.send(Notice::Performed {
+                    number: marks.performances,
+                    zero: zero.offset_by_secs(-self.config.input_latency_s),
+                });
+                if self.learning.refine {
+                    let taken = lessons.keep(session.driven());
+                    match taken.and_then(|name| lessons.refine().map(|()| name)) {
+                        Ok(name) => drop(notices.send(Notice::Kept(name))),
+                        Err(e) => console.note(e.to_string()),
+                    }
+                }
+            }
+            let between = matches!(advice, Advice::Performed | Advice::Between);
+            if between && !lessons.is_busy() && (session.is_ready() || task.is_in_trouble()) {
+                task.go_on();
+                continue;
+            }
             // Whoever says stop is not left before the robot says it has.
             if advice == Advice::Finished && !session.stop_is_unconfirmed() {
                 return self.leave(session, link, marks).await;
@@ -394,7 +461,18 @@ impl Daemon {
                     Word::Reset if session.reset() => {}
                     Word::Reset => console.note("the reset is discarded: the robot has not confirmed the stop yet"),
                     Word::Pair(_) | Word::Yes | Word::No => console.note(NOT_HERE),
+                    word @ (Word::Keep | Word::Refine | Word::Save(_)) => {
+                        let said = self.lesson(&word, session, lessons, notices);
+                        if let Err(e) = said {
+                            console.note(e.to_string());
+                        }
+                    }
                 },
+                lesson = lessons.finished() => {
+                    if let Some(skill) = self.learned(lesson, lessons, notices) {
+                        session.replace_skill(skill);
+                    }
+                }
                 frame = link.frames.recv() => match frame {
                     Some(Ok(frame)) => {
                         if let Err(e) = session.handle_control(self.now(), &frame) {
@@ -425,6 +503,69 @@ impl Daemon {
             Some(key) => self.trust.withdrawn(key).await,
             None => Standing::Unknown,
         }
+    }
+
+    /// What the person at the terminal says of learning.
+    fn lesson(
+        &self,
+        word: &Word,
+        session: &Session,
+        lessons: &mut Lessons,
+        notices: &mpsc::UnboundedSender<Notice>,
+    ) -> Result<(), LessonError> {
+        match word {
+            Word::Keep => {
+                let _ = notices.send(Notice::Kept(lessons.keep(session.driven())?));
+            }
+            Word::Refine => lessons.refine()?,
+            Word::Save(file) => {
+                lessons.save(file)?;
+                let _ = notices.send(Notice::Saved(file.clone()));
+            }
+            Word::Stop | Word::Reset | Word::Pair(_) | Word::Yes | Word::No => {}
+        }
+        Ok(())
+    }
+
+    /// Tells what was learned, saves it if that is wanted, and returns the skill if it is a new one.
+    fn learned(
+        &self,
+        lesson: Result<Lesson, LessonError>,
+        lessons: &Lessons,
+        notices: &mpsc::UnboundedSender<Notice>,
+    ) -> Option<Arc<Skill>> {
+        let note = |text: String| drop(notices.send(Notice::Note(text.into())));
+        let lesson = match lesson {
+            Ok(lesson) => lesson,
+            Err(e) => {
+                note(e.to_string());
+                return None;
+            }
+        };
+        for (name, why) in &lesson.left_out {
+            note(format!("{name} is not learned from: {why}"));
+        }
+        for what in lesson.learned.iter().filter(|what| what.is_unlike()) {
+            note(format!(
+                "{} is unlike what the skill has seen: {:.0} % of it is new",
+                what.name,
+                what.novel * 1e2
+            ));
+        }
+        let skill = lesson.skill?;
+        let learned = lesson.learned.into_iter().map(|w| (w.name, w.novel));
+        let _ = notices.send(Notice::Refined {
+            skill: Arc::clone(&skill),
+            learned: learned.collect(),
+        });
+        let folder = self.learning.save.as_deref();
+        if let Some(file) = folder.and_then(|folder| lessons.file_in(folder)) {
+            match lessons.save(&file) {
+                Ok(()) => drop(notices.send(Notice::Saved(file))),
+                Err(e) => note(e.to_string()),
+            }
+        }
+        Some(skill)
     }
 
     fn flush(
@@ -485,6 +626,7 @@ struct Marks {
     granted: Option<Counts>,
     released: Option<Counts>,
     progress: f64,
+    performances: u32,
 }
 
 impl Marks {

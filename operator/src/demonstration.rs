@@ -4,6 +4,7 @@
 mod error;
 mod folder;
 pub(crate) mod frames;
+mod person;
 #[cfg(test)]
 mod tests;
 
@@ -18,6 +19,7 @@ use telemime_protocol::skill::Placement;
 
 pub use error::{DemonstrationError, Notice};
 pub use folder::Demonstrations;
+pub use person::{PersonPattern, PersonPatternError};
 
 /// A demonstration needs at least this many samples.
 pub const LEAST_SAMPLES: usize = 8;

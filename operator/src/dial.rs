@@ -12,8 +12,8 @@ use quinn::{Connecting, Connection, Endpoint};
 use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::quic::{self, Refusal};
 use telemime_protocol::wire::frame::Frame;
-use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
-use telemime_protocol::wire::v1;
+use telemime_protocol::wire::hello::{Answer, RejectCode};
+use telemime_protocol::wire::{Version, Versions};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until, timeout};
@@ -47,6 +47,7 @@ pub(crate) struct Link {
     pub(crate) writer: Writer,
     pub(crate) frames: mpsc::Receiver<Result<Frame, ControlError>>,
     pub(crate) epoch: u32,
+    pub(crate) version: Version,
     /// From the first packet to the answer; more than the round trip by what their lengths take.
     answered: Duration,
 }
@@ -117,6 +118,7 @@ impl Pace {
 pub(crate) struct Dialler {
     endpoint: Endpoint,
     robot: SocketAddr,
+    offered: Versions,
     pace: Pace,
     attempts: JoinSet<(bool, Result<Link, DialError>)>,
     patient: bool,
@@ -126,10 +128,16 @@ pub(crate) struct Dialler {
 
 impl Dialler {
     /// Begins with the first poll of [`Dialler::next`]; `seen` is what the last link was like.
-    pub(crate) fn new(endpoint: &Endpoint, robot: SocketAddr, seen: Option<Seen>) -> Self {
+    pub(crate) fn new(
+        endpoint: &Endpoint,
+        robot: SocketAddr,
+        offered: Versions,
+        seen: Option<Seen>,
+    ) -> Self {
         Self {
             endpoint: endpoint.clone(),
             robot,
+            offered,
             pace: Pace::new(seen),
             attempts: JoinSet::new(),
             patient: false,
@@ -163,7 +171,7 @@ impl Dialler {
                 }
                 let patient = !std::mem::replace(&mut self.patient, true);
                 let within = if patient { self.pace.next_patient() } else { self.pace.brisk };
-                let attempt = attempt(self.endpoint.clone(), self.robot, within, self.answered_tx.clone());
+                let attempt = attempt(self.endpoint.clone(), self.robot, self.offered, within, self.answered_tx.clone());
                 self.attempts.spawn(async move { (patient, attempt.await) });
                 None
             }
@@ -175,6 +183,7 @@ impl Dialler {
 async fn attempt(
     endpoint: Endpoint,
     robot: SocketAddr,
+    offered: Versions,
     within: Duration,
     answered: watch::Sender<Option<Instant>>,
 ) -> Result<Link, DialError> {
@@ -188,11 +197,15 @@ async fn attempt(
     answer.map_err(silent)?.map_err(|e| failed(&e))?;
     let now = Instant::now();
     answered.send_replace(Some(now));
-    let rest = timeout(LONGEST_ATTEMPT, connect(connecting, now - begun)).await;
+    let rest = timeout(LONGEST_ATTEMPT, connect(connecting, offered, now - begun)).await;
     rest.map_err(silent)?
 }
 
-async fn connect(connecting: Connecting, answered: Duration) -> Result<Link, DialError> {
+async fn connect(
+    connecting: Connecting,
+    offered: Versions,
+    answered: Duration,
+) -> Result<Link, DialError> {
     let connection = connecting.await.map_err(|e| failed(&e))?;
     // With TLS 1.3 the handshake seems complete before the server has looked at our key.
     let again = |e: ControlError| match &e {
@@ -202,31 +215,26 @@ async fn connect(connecting: Connecting, answered: Duration) -> Result<Link, Dia
             .map_or_else(|| DialError::Again(e.to_string()), |lost| failed(&lost)),
     };
     let mut control = Control::open(&connection).await.map_err(again)?;
-    let hello = Hello {
-        min: v1::VERSION,
-        max: v1::VERSION,
-        features: 0,
-    };
-    control.write(&hello.encode()).await.map_err(again)?;
+    let hello = offered.hello().encode();
+    control.write(&hello).await.map_err(again)?;
     match control.answer().await.map_err(again)? {
-        Answer::Ack {
-            version: v1::VERSION,
-            epoch,
-            ..
-        } => {
+        Answer::Ack { version, epoch, .. } => {
+            let Some(version) = offered.known(version) else {
+                return Err(DialError::Rejected {
+                    code: RejectCode::Version,
+                    text: format!("it answers with version {version}, which we did not offer"),
+                });
+            };
             let (writer, frames) = control.into_frames();
             Ok(Link {
                 connection,
                 writer,
                 frames,
                 epoch,
+                version,
                 answered,
             })
         }
-        Answer::Ack { version, .. } => Err(DialError::Rejected {
-            code: RejectCode::Version,
-            text: format!("it answers with version {version}, which we did not offer"),
-        }),
         Answer::Reject { code, text } => Err(DialError::Rejected { code, text }),
     }
 }

@@ -1,5 +1,7 @@
 //! What the operator is to do: replay a recording as if the hand were there, or play a skill.
 
+use std::collections::VecDeque;
+
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, Refusal, RobotState};
@@ -30,6 +32,10 @@ pub enum Outcome {
 pub enum Advice {
     /// Go on.
     Continue,
+    /// A performance is over; said once.
+    Performed,
+    /// Another may follow: [`Task::go_on`] when it may.
+    Between,
     /// The task is over: leave.
     Finished,
 }
@@ -56,12 +62,16 @@ enum Phase {
     Engaged,
     /// Released; leave at this time.
     Leaving(Stamp),
+    /// At rest after a performance.
+    Between,
     Over,
 }
 
 /// A task in progress.
 pub struct Task {
     work: Work,
+    /// Recordings to replay after this one.
+    then: VecDeque<Recording>,
     phase: Phase,
     /// When the recording's rest began.
     started: Option<Stamp>,
@@ -76,6 +86,13 @@ impl Task {
         Self::new(Work::Replay { recording, next: 0 })
     }
 
+    /// And then another one: an engagement of its own, in the same session.
+    #[must_use]
+    pub fn and_then(mut self, recording: Recording) -> Self {
+        self.then.push_back(recording);
+        self
+    }
+
     /// Plays `plan`.
     pub fn play(plan: impl Into<PosePlan>) -> Self {
         Self::new(Work::Play { plan: plan.into() })
@@ -84,6 +101,7 @@ impl Task {
     fn new(work: Work) -> Self {
         Self {
             work,
+            then: VecDeque::new(),
             phase: Phase::Waiting(None),
             started: None,
             engaged_at: None,
@@ -113,19 +131,20 @@ impl Task {
     /// Whether nothing more can come of it, at `now`.
     pub fn is_over(&self, now: Stamp) -> bool {
         self.phase == Phase::Over
-            || match &self.work {
-                Work::Replay { recording, .. } => {
-                    let end_s = recording.samples.last().map_or(0.0, |s| s.t_s);
-                    self.zero()
-                        .is_some_and(|zero| now.secs_since(zero) > end_s + LEAVE_S)
+            || self.then.is_empty()
+                && match &self.work {
+                    Work::Replay { recording, .. } => {
+                        let end_s = recording.samples.last().map_or(0.0, |s| s.t_s);
+                        self.zero()
+                            .is_some_and(|zero| now.secs_since(zero) > end_s + LEAVE_S)
+                    }
+                    Work::Play { .. } => self.trouble.is_some(),
                 }
-                Work::Play { .. } => self.trouble.is_some(),
-            }
     }
 
     /// Whether the clutch has been let go after an engagement.
     pub fn has_released(&self) -> bool {
-        matches!(self.phase, Phase::Leaving(_) | Phase::Over)
+        matches!(self.phase, Phase::Leaving(_) | Phase::Between | Phase::Over)
     }
 
     /// How it ended; `quit` says that it was cut short from outside.
@@ -146,7 +165,7 @@ impl Task {
             )),
             // The next session is asked as soon as it is there.
             Phase::Waiting(_) => self.phase = Phase::Waiting(None),
-            Phase::Leaving(_) | Phase::Over => {}
+            Phase::Leaving(_) | Phase::Between | Phase::Over => {}
         }
     }
 
@@ -182,7 +201,13 @@ impl Task {
     pub fn advise(&mut self, now: Stamp, session: &mut Session) -> Advice {
         match self.phase {
             Phase::Over => return Advice::Finished,
+            Phase::Between => return Advice::Between,
             Phase::Leaving(at) if now >= at => {
+                let performed = matches!(self.work, Work::Replay { .. }) && self.trouble.is_none();
+                if performed {
+                    self.phase = Phase::Between;
+                    return Advice::Performed;
+                }
                 self.phase = Phase::Over;
                 return Advice::Finished;
             }
@@ -225,9 +250,30 @@ impl Task {
         Advice::Continue
     }
 
+    /// Whether something happened after which nothing more is driven.
+    pub fn is_in_trouble(&self) -> bool {
+        self.trouble.is_some()
+    }
+
+    /// After [`Advice::Between`]: begins the next performance, or ends the task if there is none.
+    pub fn go_on(&mut self) {
+        if self.phase != Phase::Between {
+            return;
+        }
+        let next = self.then.pop_front().filter(|_| self.trouble.is_none());
+        self.phase = match next {
+            None => Phase::Over,
+            Some(recording) => {
+                self.work = Work::Replay { recording, next: 0 };
+                (self.started, self.engaged_at, self.requests) = (None, None, 0);
+                Phase::Waiting(None)
+            }
+        };
+    }
+
     /// When [`Task::advise`] has something to do next.
     pub fn poll_timeout(&self) -> Option<Stamp> {
-        if self.phase == Phase::Over {
+        if matches!(self.phase, Phase::Between | Phase::Over) {
             return None;
         }
         // A replay asks with its next sample; only a plan is asked for by the clock.

@@ -343,23 +343,21 @@ fn operator_datagram() -> impl Strategy<Value = OperatorDatagram> {
                 lease_ms
             }
         ),
-        (
-            any::<u32>(),
-            any::<[i64; 3]>(),
-            proptest::option::of(any::<(i64, u32)>())
-        )
-            .prop_map(|(epoch, [t1_us, t2_us, t3_us], external)| {
-                OperatorDatagram::Pong {
-                    epoch,
-                    t1_us,
-                    t2_us,
-                    t3_us,
-                    external: external.map(|(ahead_us, dispersion_us)| ExternalClock {
-                        ahead_us,
-                        dispersion_us,
-                    }),
-                }
-            }),
+        (any::<u32>(), any::<[i64; 3]>()).prop_map(|(epoch, [t1_us, t2_us, t3_us])| {
+            OperatorDatagram::Pong {
+                epoch,
+                t1_us,
+                t2_us,
+                t3_us,
+            }
+        }),
+        any::<(u32, i64, u32)>().prop_map(|(epoch, ahead_us, dispersion_us)| {
+            let clock = ExternalClock {
+                ahead_us,
+                dispersion_us,
+            };
+            OperatorDatagram::Clock { epoch, clock }
+        }),
         any::<u32>().prop_map(|epoch| OperatorDatagram::Stop { epoch }),
     ]
 }

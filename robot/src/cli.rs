@@ -15,6 +15,7 @@ use telemime_endpoint::pairing::{Candidate, Own};
 use telemime_endpoint::peers::{Role, Source, Whom};
 use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Trust, quic};
 use telemime_sim::arm::LoadOptions;
+use telemime_sim::link::parse_duration_s;
 use tokio::sync::mpsc;
 
 use crate::clock::Origin;
@@ -78,6 +79,15 @@ pub struct Args {
         allow_negative_numbers = true
     )]
     pub start: Option<Vec<f64>>,
+    /// The arm obeys this much late, 0 to 50ms; the prediction makes up for it [default: 0ms].
+    #[arg(long, value_name = "TIME", value_parser = parse_duration_s)]
+    pub dead_time: Option<f64>,
+    /// Bandwidth of the filter between prediction and arm, rad/s: less is smoother, and farther behind [default: 45].
+    #[arg(long, value_name = "RAD_S")]
+    pub bandwidth: Option<f64>,
+    /// Speak protocol versions up to this one; 2 is an experiment [default: 1].
+    #[arg(long, value_name = "N")]
+    pub protocol_max: Option<u16>,
     /// Write every tick to this CSV file.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
@@ -105,6 +115,9 @@ struct File {
     #[serde(default)]
     fixed: std::collections::BTreeMap<String, f64>,
     start: Option<Vec<f64>>,
+    dead_time_s: Option<f64>,
+    bandwidth_rad_s: Option<f64>,
+    protocol_max: Option<u16>,
     record: Option<PathBuf>,
 }
 
@@ -134,6 +147,7 @@ pub enum Event {
     },
     Connected {
         epoch: u32,
+        version: u16,
         peer: SocketAddr,
     },
     Disconnected {
@@ -239,7 +253,14 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
             fixed,
         },
         start: args.start.clone().or(file.start),
-        control: ControlConfig::default(),
+        control: ControlConfig {
+            dead_time_s: args.dead_time.or(file.dead_time_s).unwrap_or(0.0),
+            omega: args
+                .bandwidth
+                .or(file.bandwidth_rad_s)
+                .unwrap_or(ControlConfig::default().omega),
+            ..ControlConfig::default()
+        },
         ..RigOptions::default()
     };
     let rig = Rig::load(&options)?;
@@ -278,8 +299,9 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let (rings, handle) = servo::rings();
     let running = servo::thread::Servo::start(rig.servo(rings)).context("no servo thread")?;
     let brake = handle.brake.clone();
-    let help = "stop, reset, pair [60s], yes, no or quit?";
-    let (quit, words) = cli::listen(args.follow_stdin, help, move || brake.stop_here())?;
+    let (quit, words) = cli::listen(args.follow_stdin, cli::ROBOT_WORDS, move || {
+        brake.stop_here()
+    })?;
     let (out, printing) = Printer::start().context("no thread to print from")?;
     let log = Log {
         json: args.json,
@@ -311,7 +333,10 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         endpoint,
         HostClock::new(),
         rig.info(),
-        SessionConfig::default(),
+        SessionConfig {
+            versions: cli::versions(args.protocol_max.or(file.protocol_max))?,
+            ..SessionConfig::default()
+        },
         handle,
         Some(running.timing.clone()),
         desk,
@@ -454,10 +479,17 @@ async fn listen_to(
                     });
                 }
             }
-            Notice::Connected { epoch, peer } => {
-                log.say(&Event::Connected { epoch, peer }, || {
-                    format!("operator {peer} (session {epoch})")
-                });
+            Notice::Connected {
+                epoch,
+                version,
+                peer,
+            } => {
+                let connected = Event::Connected {
+                    epoch,
+                    version: version.number(),
+                    peer,
+                };
+                log.say(&connected, || format!("operator {peer} (session {epoch})"));
             }
             Notice::Disconnected {
                 why,
@@ -555,13 +587,13 @@ impl Recorder {
         let (queue, reports) = sync_channel::<Report>(QUEUE);
         let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
             let mut out = std::io::BufWriter::new(file);
-            write!(out, "tick,mono_ns,state,engagement,age_s,clamps,tip_x,tip_y,tip_z,target_x,target_y,target_z,tip_qw,tip_qx,tip_qy,tip_qz,opening")?;
+            write!(out, "tick,mono_ns,state,engagement,age_s,clamps,tip_x,tip_y,tip_z,target_x,target_y,target_z,tip_qw,tip_qx,tip_qy,tip_qz,opening,jerk")?;
             (0..dof).try_for_each(|i| write!(out, ",q{i}"))?;
             writeln!(out)?;
             for r in reports {
                 write!(out, "{},{},{:?},{},{:.6},{}", r.tick, r.at.0, r.state, r.engagement.number, r.age_s, r.clamps)?;
                 let q = &r.orientation;
-                let turn = [q.w, q.i, q.j, q.k, r.opening];
+                let turn = [q.w, q.i, q.j, q.k, r.opening, r.jerk_m_s3];
                 r.tip_m.iter().chain(&r.target_m).chain(&turn).try_for_each(|v| write!(out, ",{v:.6}"))?;
                 r.q.iter().take(dof).try_for_each(|v| write!(out, ",{v:.6}"))?;
                 writeln!(out)?;

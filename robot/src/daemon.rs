@@ -8,15 +8,17 @@ use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::{External, Fingerprint, HostClock, Mono, Standing, Trust, quic, trust};
 use telemime_protocol::skill::Skill;
+use telemime_protocol::wire::Version;
 use telemime_protocol::wire::frame::Frame;
-use telemime_protocol::wire::hello::{Answer, Hello, RejectCode, negotiate};
+use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::pair;
-use telemime_protocol::wire::v1::{self, Cause, Info, RobotState};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
+use telemime_protocol::wire::v1::{Cause, Info, RobotState};
+use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep_until};
 
 use crate::clock::Origin;
 use crate::desk::{Desk, Progress};
+use crate::door::{self, Door, Place, Verdict};
 use crate::refused::{Reason, Refused, Tally};
 use crate::servo::thread::Timing;
 use crate::servo::{Handle, Order, Report};
@@ -41,9 +43,6 @@ const MAX_SILENT_DRAINS: u32 = 125;
 
 /// A stop takes a fraction of a second; after this many drains (2 s) the servo itself must be dead.
 const MAX_STOP_DRAINS: u32 = 500;
-
-/// Connections that may be greeting at the same time.
-const MAX_GREETING: usize = 8;
 
 /// An operator that comes back takes its own old session's place once that has been silent for two keep-alives:
 /// its connection is dead, and only its time-out does not know yet.
@@ -81,6 +80,8 @@ pub enum Notice {
     Connected {
         /// The session's epoch.
         epoch: u32,
+        /// The protocol version both speak.
+        version: Version,
         /// Its address.
         peer: std::net::SocketAddr,
     },
@@ -183,14 +184,14 @@ impl Daemon {
         mut words: mpsc::UnboundedReceiver<Word>,
         notices: mpsc::UnboundedSender<Notice>,
     ) -> Result<(), ServoDead> {
-        let (arrivals_tx, mut arrivals) = mpsc::channel::<Arrival>(MAX_GREETING);
+        let (arrivals_tx, mut arrivals) = mpsc::channel::<Arrival>(door::PLACES);
         let mut drain = interval(DRAIN);
         drain.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let trust = self.desk.trust().clone();
         let mut active: Option<Active> = None;
         let mut skill: Option<Arc<Skill>> = None;
         let mut epoch = 0;
-        let permits = Arc::new(Semaphore::new(MAX_GREETING));
+        let door = Door::default();
         loop {
             let ended = self.flush(active.as_mut());
             if let Some(why) = ended {
@@ -212,6 +213,8 @@ impl Daemon {
                         let told = self.desk.word(word == Word::Yes).map(Notice::Pairing);
                         told.map(|notice| notices.send(notice));
                     }
+                    // What an operator says; a robot's terminal does not know them.
+                    Word::Keep | Word::Refine | Word::Save(_) => {}
                 },
                 _ = drain.tick() => {
                     self.drain(active.as_mut(), &notices);
@@ -230,12 +233,18 @@ impl Daemon {
                     }
                 }
                 incoming = self.endpoint.accept() => match incoming {
-                    Some(incoming) => match permits.clone().try_acquire_owned() {
-                        Ok(permit) => {
-                            tokio::spawn(arrive(incoming, permit, trust.clone(), arrivals_tx.clone()));
+                    Some(incoming) => {
+                        let from = incoming.remote_address().ip();
+                        match door.knock(from, incoming.remote_address_validated()) {
+                            Verdict::Enter(place) => {
+                                let arriving = arrive(incoming, place, trust.clone(), arrivals_tx.clone());
+                                tokio::spawn(tokio::time::timeout(door::STAY, arriving));
+                            }
+                            // It may not be asked twice: then it knows a token already.
+                            Verdict::Prove => drop(incoming.retry().map_err(|e| e.into_incoming().refuse())),
+                            Verdict::Refuse => incoming.refuse(),
                         }
-                        Err(_) => incoming.refuse(),
-                    },
+                    }
                     None => break,
                 },
                 progress = self.desk.next() => {
@@ -297,7 +306,7 @@ impl Daemon {
             hello,
         } = greeted;
         let now = self.clock.now();
-        let agreed = negotiate(&hello, v1::VERSION, v1::VERSION);
+        let agreed = self.config.versions.choose(&hello);
         let half_open = agreed.is_some()
             && active.as_mut().is_some_and(|held| {
                 held.listen(now);
@@ -307,45 +316,48 @@ impl Daemon {
             let why = (CLOSED, "its operator has come back");
             self.end(active, skill, why, notices);
         }
-        let refusal = match agreed {
-            None => Some((
+        let versions = self.config.versions;
+        let agreed = match agreed {
+            None => Err((
                 RejectCode::Version,
                 Reason::Version,
                 format!(
-                    "this robot speaks version {}, you offer {} to {}",
-                    v1::VERSION,
-                    hello.min,
-                    hello.max
+                    "this robot speaks {versions}, you offer {} to {}",
+                    hello.min, hello.max
                 ),
             )),
-            Some(_) if active.is_some() => Some((
+            Some(_) if active.is_some() => Err((
                 RejectCode::Busy,
                 Reason::Busy,
                 "another operator has authority".to_owned(),
             )),
-            Some(_) => None,
+            Some(version) => Ok(version),
         };
         let peer = connection.remote_address();
-        if let Some((code, reason, text)) = refusal {
-            // Attempts of one operator overlap: those that were under way when it was let in are no news.
-            let own = active.as_ref().is_some_and(|held| {
-                let overlaps = now.secs_since(held.began) < OVERLAP_S;
-                overlaps && held.key == key && held.connection.remote_address() == peer
-            });
-            let refused = (!own).then(|| (peer, reason, text.clone()));
-            tokio::spawn(turn_away(connection, control, code, text));
-            return refused;
-        }
+        let version = match agreed {
+            Ok(version) => version,
+            Err((code, reason, text)) => {
+                // Attempts of one operator overlap: those that were under way when it was let in are no news.
+                let own = active.as_ref().is_some_and(|held| {
+                    let overlaps = now.secs_since(held.began) < OVERLAP_S;
+                    overlaps && held.key == key && held.connection.remote_address() == peer
+                });
+                let refused = (!own).then(|| (peer, reason, text.clone()));
+                tokio::spawn(turn_away(connection, control, code, text));
+                return refused;
+            }
+        };
         *epoch += 1;
         let ack = Answer::Ack {
-            version: v1::VERSION,
+            version: version.number(),
             features: 0,
             epoch: *epoch,
         };
         let (writer, frames) = control.into_frames();
         // The first of an empty queue.
         let _ = writer.raw(ack.encode());
-        let session = Session::new(self.config, self.info.clone(), *epoch, skill.clone(), now);
+        let session = Session::new(self.config, self.info.clone(), *epoch, skill.clone(), now)
+            .speaking(version);
         *active = Some(Active {
             session,
             connection,
@@ -357,6 +369,7 @@ impl Daemon {
         });
         let _ = notices.send(Notice::Connected {
             epoch: *epoch,
+            version,
             peer,
         });
         None
@@ -524,12 +537,7 @@ impl Active {
 }
 
 /// Handshake and greeting, beside the running session.
-async fn arrive(
-    incoming: Incoming,
-    _permit: OwnedSemaphorePermit,
-    trust: Trust,
-    arrivals: mpsc::Sender<Arrival>,
-) {
+async fn arrive(incoming: Incoming, _place: Place, trust: Trust, arrivals: mpsc::Sender<Arrival>) {
     let peer = incoming.remote_address();
     let arrival = greet(incoming, &trust).await;
     let arrival = arrival.unwrap_or_else(|(reason, why)| Arrival::Refused(peer, reason, why));

@@ -9,6 +9,7 @@ pub mod clock;
 pub mod control;
 pub mod daemon;
 pub mod desk;
+pub mod door;
 pub mod refused;
 pub mod rig;
 pub mod safety;

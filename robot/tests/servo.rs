@@ -35,8 +35,12 @@ fn forecast() -> Forecast {
 
 impl Bench {
     fn new() -> Self {
+        Self::with(&RigOptions::default())
+    }
+
+    fn with(options: &RigOptions) -> Self {
         let (rings, handle) = rings();
-        let core = Rig::load(&RigOptions::default()).unwrap().servo(rings);
+        let core = Rig::load(options).unwrap().servo(rings);
         let mut bench = Self {
             core,
             handle,
@@ -227,4 +231,48 @@ fn engaging_again_and_again_does_not_walk_out_of_the_workspace() {
     }
     let over_mm = (farthest_m - workspace.radius_m) * 1e3;
     assert!((-1.0..1.0).contains(&over_mm), "{over_mm} mm beyond");
+}
+
+#[test]
+fn an_arm_that_has_yet_to_obey_is_not_at_rest_and_not_engaged() {
+    let mut options = RigOptions::default();
+    options.control.dead_time_s = 0.05;
+    let mut bench = Bench::with(&options);
+    bench.engage(1, 0.1);
+    assert_eq!(bench.tick_at(2).state, RobotState::Engaged);
+    let hand = |x: f64| HandState::first(Stamp::ZERO, HAND_M + Vector3::x() * x);
+    let far = Forecast::constant_velocity(&hand(0.3), &Params::DEFAULT);
+    let lease = bench.lease();
+    bench.order(Order::Track {
+        ticket: ticket(1),
+        forecast: far,
+        valid_at: Mono(2 * MS),
+        turn: None,
+        grip: None,
+        lease,
+    });
+    // The displacement is eased in: after 40 ms it is asked for, and the arm has not moved.
+    let still = bench.tick_at(3);
+    let mut report = still;
+    for ms in 4..60 {
+        report = bench.tick_at(ms);
+        if report.moving {
+            break;
+        }
+    }
+    assert!(report.moving);
+    assert!((report.q - still.q).amax() < 1e-9, "not yet");
+    bench.order(Order::Release(ticket(1)));
+    let from = bench.now_ms + 1;
+    let mut rested = None;
+    for ms in from..from + 600 {
+        let report = bench.tick_at(ms);
+        let obeying = report.tip_m != still.tip_m;
+        if rested.is_none() && obeying && !report.moving {
+            rested = Some((ms, report.q));
+        }
+    }
+    let (_, q) = rested.unwrap();
+    let end = bench.tick_at(from + 700);
+    assert!((end.q - q).amax() < 1e-4, "what is said to rest rests");
 }

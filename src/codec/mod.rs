@@ -203,8 +203,8 @@ fn text(study: &Study) -> String {
         }
     }
     line(
-        "\nbytes: bit codes of one order a column, the same for all (the live knots: as on the wire);\n\
-         varints: the same differences in whole bytes."
+        "\nbytes: bit codes of one order a column, the same for all (the live knots: in one block, as by the stream);\n\
+         varints: the same differences in whole bytes (the live knots: in a block for every two, as motions bring them)."
             .into(),
     );
     if let Some(turn) = &study.orientation {

@@ -14,7 +14,9 @@ use telemime_robot::servo::{Mapping, RAMP_S};
 
 use super::processes::Run;
 use super::{Args, Material};
-use crate::measure::{Hand, Track, Turns, follow, is_edge, rmse_m, sample_and_hold};
+use crate::measure::{
+    Hand, Track, Turns, follow, is_edge, rms, rmse_m, sample_and_hold, smooth_jerk_m_s3,
+};
 
 /// One way of following the hand.
 pub(super) struct Way {
@@ -47,6 +49,9 @@ pub(super) struct Verdict {
     pub(super) predicted: Way,
     /// The same for the orientation, where the recording has it and the arm followed it.
     pub(super) turn: Option<TurnVerdict>,
+    /// RMS jerk of the tip's reference, m/s³, and over that of the scaled hand; `None` of a hand that rests.
+    pub(super) jerk_m_s3: f64,
+    pub(super) jerk_ratio: Option<f64>,
     pub(super) clamps: u32,
     pub(super) coasted: u32,
     /// Ticks between the first and the last recorded that the record does not hold.
@@ -102,6 +107,7 @@ pub(super) struct Tick {
     pub(super) tip_m: Vector3<f64>,
     tip_q: UnitQuaternion<f64>,
     pub(super) clamps: u32,
+    jerk_m_s3: f64,
 }
 
 /// The ticks of the first engagement, in order.
@@ -117,6 +123,7 @@ pub(super) fn read_ticks(path: &Path, from_ns: i64) -> anyhow::Result<Vec<Tick>>
     };
     let (tick, mono, clamps) = (column("tick")?, column("mono_ns")?, column("clamps")?);
     let engagement = column("engagement")?;
+    let jerk = column("jerk")?;
     let tip = [column("tip_x")?, column("tip_y")?, column("tip_z")?];
     let [w, i, j, k] = [
         column("tip_qw")?,
@@ -147,6 +154,7 @@ pub(super) fn read_ticks(path: &Path, from_ns: i64) -> anyhow::Result<Vec<Tick>>
                 mono_ns,
                 tip_m,
                 clamps: row[clamps].parse()?,
+                jerk_m_s3: row[jerk].parse()?,
             });
         }
     }
@@ -198,6 +206,7 @@ pub(super) fn rig(args: &Args) -> anyhow::Result<Rig> {
         ..RigOptions::default()
     };
     options.load.tip = args.tip.clone();
+    options.control.dead_time_s = args.dead_time;
     Ok(Rig::load(&options)?)
 }
 
@@ -282,6 +291,13 @@ pub(super) fn judge(args: &Args, material: &Material, run: &Run) -> anyhow::Resu
         _ => None,
     };
 
+    let judged = ticks
+        .iter()
+        .filter(|t| (from_s..end_s).contains(&time_s(t.mono_ns)));
+    let jerk_m_s3 = rms(judged.map(|t| t.jerk_m_s3));
+    let hand_jerk = mapping.scale * smooth_jerk_m_s3(&truth, from_s, end_s);
+    let jerk_ratio = (hand_jerk > 0.0).then(|| jerk_m_s3 / hand_jerk);
+
     let path = received_path(run);
     let (path_error_m, path_samples) = path_error(&path, &truth, zero_ns, run);
     Ok(Verdict {
@@ -291,6 +307,8 @@ pub(super) fn judge(args: &Args, material: &Material, run: &Run) -> anyhow::Resu
         floor: way(floor.tip),
         turn,
         predicted: way(tip),
+        jerk_m_s3,
+        jerk_ratio,
         clamps,
         ticks_lost: missing(&ticks),
         coasted: count_state(run, "Coasting"),
@@ -413,6 +431,7 @@ mod tests {
             tip_m: Vector3::zeros(),
             tip_q: UnitQuaternion::identity(),
             clamps: 0,
+            jerk_m_s3: 0.0,
         }
     }
 

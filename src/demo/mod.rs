@@ -14,6 +14,7 @@ use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use telemime_operator::cli::Axes;
 use telemime_operator::demonstration::{Demonstration, Demonstrations, Sample};
 use telemime_sim::hand::swing_with_wrist;
+use telemime_sim::link::parse_duration_s;
 
 use crate::cli::Shape;
 
@@ -44,12 +45,18 @@ pub(crate) struct Args {
     /// The link that follows the hand.
     #[arg(long, value_name = "LINK")]
     tip: Option<String>,
+    /// The arm obeys this much late, 0 to 50ms.
+    #[arg(long, value_name = "TIME", default_value = "0ms", value_parser = parse_duration_s)]
+    dead_time: f64,
     /// The recordings' axes.
     #[arg(long, value_enum, default_value_t = Axes::Kinect)]
     axes: Axes,
     /// Tip metres per hand metre [default: from the demonstrations and the arm's limits].
     #[arg(long)]
     scale: Option<f64>,
+    /// Play the sensor: hand every sample over this late, and tell the operator so.
+    #[arg(long, value_name = "TIME", default_value = "0ms", value_parser = parse_duration_s)]
+    input_latency: f64,
     /// Which person performs, and how.
     #[arg(long, default_value_t = 7)]
     seed: u64,

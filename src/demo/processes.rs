@@ -118,6 +118,10 @@ pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> any
     robot_args.extend(["--record".to_owned(), text(&ticks)]);
     robot_args.extend(flag("--urdf", args.urdf.as_deref().map(text)));
     robot_args.extend(flag("--tip", args.tip.as_ref()));
+    robot_args.extend(flag(
+        "--dead-time",
+        (args.dead_time > 0.0).then(|| format!("{}us", args.dead_time * 1e6)),
+    ));
     let mut robot = Process::start("robot", &robot_args)?;
     let mut robot_events: Vec<Robot> = Vec::new();
     let addr = listening(&mut robot, &mut robot_events).await?;
@@ -156,6 +160,10 @@ pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> any
     ]);
     operator_args.extend(flag("--match", material.matching.as_ref()));
     operator_args.extend(flag("--scale", args.scale));
+    operator_args.extend(flag(
+        "--input-latency",
+        (args.input_latency > 0.0).then(|| format!("{}ms", args.input_latency * 1e3)),
+    ));
     operator_args.extend([
         "--axes".to_owned(),
         format!("{:?}", args.axes).to_lowercase(),

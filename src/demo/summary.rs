@@ -32,6 +32,9 @@ struct Result {
     lag_floor_ms: f64,
     lag_predicted_ms: f64,
     scale: f64,
+    jerk_m_s3: f64,
+    jerk_ratio: Option<f64>,
+    glitches: u32,
     clamps: u32,
     coasted: u32,
     bytes_on_wire: u64,
@@ -143,6 +146,7 @@ fn gather(
     let Some(Operator::Done {
         samples,
         samples_at_rest,
+        glitches,
         messages,
         knots,
         bytes_on_wire,
@@ -182,6 +186,9 @@ fn gather(
         lag_floor_ms: verdict.floor.lag_s * 1e3,
         lag_predicted_ms: verdict.predicted.lag_s * 1e3,
         scale: verdict.mapping.scale,
+        jerk_m_s3: verdict.jerk_m_s3,
+        jerk_ratio: verdict.jerk_ratio,
+        glitches: *glitches,
         clamps: verdict.clamps,
         coasted: verdict.coasted,
         bytes_on_wire: *bytes_on_wire,
@@ -237,7 +244,8 @@ fn table(r: &Result) -> String {
          as sent, delayed, through the arm    {}   {}\n\
          predicted                            {}   {}   {}\n\
          floor: perfect knowledge, same arm   {}   {}\n\n\
-         {turn}on the wire   {} B of motion in {} messages; raw streaming {} B; ratio {:.2}\n\
+         {turn}smoothness    RMS jerk {:.0} m/s³ at the tip{}\n\
+         on the wire   {} B of motion in {} messages; raw streaming {} B; ratio {:.2}\n\
          path          {} checkpoints for {} samples; within {} of the hand ({} promised)\n\
          session       {} B up, {} B down besides (keys, model, acknowledgements, telemetry){clock}\n\
          servo         {:.1} µs a tick, {:.1} µs p99, {} late, {} not recorded; a limit acted on {} ticks; coasted {} times\n",
@@ -257,6 +265,10 @@ fn table(r: &Result) -> String {
         hidden,
         mm(r.rmse_floor_m),
         ms(r.lag_floor_ms),
+        r.jerk_m_s3,
+        r.jerk_ratio.map_or_else(String::new, |ratio| format!(
+            ", {ratio:.2} times that of the scaled hand"
+        )),
         r.bytes_on_wire,
         r.messages,
         r.bytes_raw,

@@ -15,7 +15,7 @@ use telemime_endpoint::{
     External, Fingerprint, HostClock, Identity, IdentityError, Meter, Mono, Trust, quic,
 };
 use telemime_operator::daemon::{
-    Daemon as OperatorDaemon, DaemonError, Notice as OperatorNotice, Summary,
+    Daemon as OperatorDaemon, DaemonError, Learning, Notice as OperatorNotice, Summary,
 };
 use telemime_operator::session::SessionConfig;
 use telemime_operator::task::Task;
@@ -25,6 +25,7 @@ use telemime_robot::daemon::{Daemon as RobotDaemon, Notice as RobotNotice};
 use telemime_robot::desk::Desk;
 use telemime_robot::rig::Rig;
 use telemime_robot::servo::{self, Report};
+use telemime_robot::session::SessionConfig as RobotConfig;
 use telemime_sim::link::LinkConfig;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval};
@@ -76,10 +77,13 @@ pub struct Pair {
     /// Whom the robot trusts.
     pub trust: Trust,
     clock: HostClock,
+    config: RobotConfig,
     external: Option<(External, External)>,
     robot_identity: Identity,
     operator_identity: Identity,
     operators: u8,
+    /// What operators started from now on learn from while driving.
+    pub learning: Learning,
 }
 
 /// The robot of a [`Pair`]: what it reports, tick by tick.
@@ -112,6 +116,7 @@ impl Robot {
         rig: &Rig,
         identity: &Identity,
         trust: &Trust,
+        config: RobotConfig,
         external: Option<External>,
     ) -> Result<Self, PairError> {
         let (rings, handle) = servo::rings();
@@ -135,7 +140,6 @@ impl Robot {
             key: identity.fingerprint(),
         };
         let desk = Desk::new(own, trust.clone(), None);
-        let config = Default::default();
         let daemon = RobotDaemon::new(endpoint, clock, rig.info(), config, handle, None, desk)
             .with_external(external);
         let (quit, quit_rx) = watch::channel(false);
@@ -226,15 +230,32 @@ impl Pair {
     /// # Errors
     /// [`PairError`].
     pub fn start(rig: &Rig) -> Result<Self, PairError> {
-        Self::start_with(rig, None)
+        Self::start_with(rig, Default::default())
+    }
+
+    /// As [`Pair::start`], with the sessions set to `config`.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn start_with(rig: &Rig, config: RobotConfig) -> Result<Self, PairError> {
+        Self::start_as(rig, config, None)
     }
 
     /// As [`Pair::start`], with disciplined clocks at the robot and at the operators.
     ///
     /// # Errors
     /// [`PairError`].
-    pub fn start_with(
+    pub fn start_disciplined(
         rig: &Rig,
+        robot: External,
+        operators: External,
+    ) -> Result<Self, PairError> {
+        Self::start_as(rig, Default::default(), Some((robot, operators)))
+    }
+
+    fn start_as(
+        rig: &Rig,
+        config: RobotConfig,
         external: Option<(External, External)>,
     ) -> Result<Self, PairError> {
         let network = Network::new();
@@ -243,16 +264,26 @@ impl Pair {
         let operator_identity = Identity::ephemeral()?;
         let trust = Trust::new([operator_identity.fingerprint()]);
         let robots = external.as_ref().map(|(robot, _)| robot.clone());
-        let robot = Robot::start(&network, clock, rig, &robot_identity, &trust, robots)?;
+        let robot = Robot::start(
+            &network,
+            clock,
+            rig,
+            &robot_identity,
+            &trust,
+            config,
+            robots,
+        )?;
         Ok(Self {
             network,
             robot,
             trust,
             clock,
+            config,
             external,
             robot_identity,
             operator_identity,
             operators: 0,
+            learning: Learning::default(),
         })
     }
 
@@ -266,7 +297,15 @@ impl Pair {
         let identity = &self.robot_identity;
         let external = self.external.as_ref().map(|(robot, _)| robot.clone());
         let (network, clock) = (&self.network, self.clock);
-        self.robot = Robot::start(network, clock, rig, identity, &self.trust, external)?;
+        self.robot = Robot::start(
+            network,
+            clock,
+            rig,
+            identity,
+            &self.trust,
+            self.config,
+            external,
+        )?;
         Ok(())
     }
 
@@ -369,6 +408,7 @@ impl Pair {
             skill,
             recogniser: None,
             config,
+            learning: self.learning.clone(),
             patience: Duration::from_secs(5),
         };
         let (quit, quit_rx) = watch::channel(false);

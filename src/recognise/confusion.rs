@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use clap::ValueEnum;
 use indicatif::ProgressBar;
-use telemime_operator::demonstration::{Demonstration, Demonstrations};
+use telemime_operator::demonstration::{Demonstration, Demonstrations, PersonPattern};
 use telemime_operator::learn::LearnOptions;
 use telemime_operator::recognise::trial::{self, ONSET_M, Report, Split, TrialOptions};
 
@@ -35,6 +35,9 @@ pub(crate) struct ConfusionArgs {
     /// Rounds of `--split demonstrations`; one in so many demonstrations is held out.
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u8).range(2..))]
     folds: u8,
+    /// Where file names hold the person: {} stands for the name, * for anything.
+    #[arg(long, value_name = "PATTERN", default_value_t)]
+    group_by: PersonPattern,
     #[command(flatten)]
     tuning: Tuning,
     /// Seed of every random choice in learning.
@@ -49,7 +52,7 @@ pub(crate) struct ConfusionArgs {
 enum Hold {
     /// Whole demonstrations, every N-th: people are known, performances new.
     Demonstrations,
-    /// All a person does (files named gesture_person_trial): people are new.
+    /// All a person does (see --group-by): people are new.
     Persons,
     /// One performance; skills are learned from that person's others alone.
     Own,
@@ -78,6 +81,7 @@ pub(crate) fn confusion(args: &ConfusionArgs) -> anyhow::Result<()> {
             Hold::Persons => Split::Persons,
             Hold::Own => Split::Own,
         },
+        persons: args.group_by.clone(),
         at_s: args.at,
         also_at_s: also_at_s.collect(),
     };

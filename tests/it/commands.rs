@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 16] = [
+const COMMANDS: [&str; 18] = [
     "demo",
     "import",
     "learn",
@@ -13,6 +13,7 @@ const COMMANDS: [&str; 16] = [
     "recognise",
     "confusion",
     "select",
+    "evaluate",
     "codec",
     "robot",
     "operator",
@@ -20,6 +21,7 @@ const COMMANDS: [&str; 16] = [
     "pair",
     "peers",
     "link",
+    "tap",
     "paper",
 ];
 

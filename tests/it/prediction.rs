@@ -173,7 +173,7 @@ impl Scores {
 }
 
 /// Demonstrations of one folder, by who performed them: `<action>_<person>_<trial>.csv`, else one group.
-fn by_person(folder: &Path) -> Vec<Vec<Demonstration>> {
+pub(crate) fn by_person(folder: &Path) -> Vec<Vec<Demonstration>> {
     let mut groups = BTreeMap::<String, Vec<Demonstration>>::new();
     let mut paths: Vec<_> = std::fs::read_dir(folder)
         .unwrap()

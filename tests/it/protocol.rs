@@ -23,8 +23,9 @@ use telemime_protocol::wire::pair::{self, AbortCode, Name, PairMessage, Transcri
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::{
-    self, Cause, Drive, Engage, Info, Message, Motion, OperatorControl, OperatorDatagram, PathTail,
-    Refusal, RobotControl, RobotDatagram, RobotState, Telemetry, WireParams, model_tag,
+    self, Cause, Drive, Engage, ExternalClock, Info, Message, Motion, OperatorControl,
+    OperatorDatagram, PathTail, Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
+    WireParams, model_tag,
 };
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo;
@@ -383,10 +384,19 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
                 t1_us: 90_000_000,
                 t2_us: 3_000_000,
                 t3_us: 3_000_000,
-                external: None,
             }),
         ),
         ("stop", message(&OperatorDatagram::Stop { epoch: 7 })),
+        (
+            "clock",
+            message(&OperatorDatagram::Clock {
+                epoch: 7,
+                clock: ExternalClock {
+                    ahead_us: 1_792_000_000_000_000,
+                    dispersion_us: 50,
+                },
+            }),
+        ),
         (
             "ping",
             message(&RobotDatagram::Ping {
@@ -592,7 +602,6 @@ fn a_plan_that_does_not_begin_at_zero_is_refused() {
             t1_us: 0,
             t2_us: 0,
             t3_us: 0,
-            external: None,
         };
         session.handle_datagram(Mono(1), &pong.encode());
     }

@@ -5,7 +5,7 @@ use std::process::{Command, Output};
 
 use nalgebra::Vector3;
 use serde_json::Value;
-use telemime_operator::demonstration::{Demonstration, Demonstrations, Sample};
+use telemime_operator::demonstration::{Demonstration, Demonstrations, PersonPattern, Sample};
 use telemime_operator::learn::LearnOptions;
 use telemime_operator::recognise::RecogniseOptions;
 use telemime_operator::recognise::trial::{self, Report, Split, TrialOptions};
@@ -31,6 +31,7 @@ fn real(dirs: &[PathBuf], split: Split, recognise: RecogniseOptions) -> Report {
             ..LearnOptions::default()
         },
         split,
+        persons: PersonPattern::default(),
         at_s: 0.7,
         also_at_s: Vec::new(),
     };

@@ -376,11 +376,9 @@ fn disciplined_clocks_take_the_asymmetry_out_and_one_that_is_set_stops_the_arm()
 
         let ahead = || Arc::new(AtomicI64::new(1_792_000_000_000_000_000));
         let (robots, operators) = (ahead(), ahead());
-        let clocks = (
-            External::stated(robots, DISPERSION),
-            External::stated(operators.clone(), DISPERSION),
-        );
-        let mut pair = Pair::start_with(&rig(), Some(clocks)).unwrap();
+        let ours = External::stated(robots, DISPERSION);
+        let theirs = External::stated(operators.clone(), DISPERSION);
+        let mut pair = Pair::start_disciplined(&rig(), ours, theirs).unwrap();
         let operator = lopsided(&mut pair, 102);
         assert!(
             pair.wait_for(20.0, |r| r.state == RobotState::Engaged)

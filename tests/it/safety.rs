@@ -294,7 +294,7 @@ async fn said_without_a_link(pair: &mut Pair, operator: &Operator, after_s: f64,
     full_speed(pair).await;
     pair.network.set_down(true);
     pair.run_for(after_s).await;
-    says.iter().for_each(|word| operator.say(*word));
+    says.iter().for_each(|word| operator.say(word.clone()));
     pair.run_for(3.0).await;
     assert!(
         !pair

@@ -80,13 +80,17 @@ pub(crate) fn rig() -> Rig {
 
 /// A replay of `samples` after a moment of rest.
 pub(crate) fn replay(samples: Samples) -> Task {
-    Task::replay(Recording {
+    Task::replay(recording(samples))
+}
+
+pub(crate) fn recording(samples: Samples) -> Recording {
+    Recording {
         samples: samples
             .into_iter()
             .map(|(t_s, x)| Sample::at(t_s, x))
             .collect(),
         rest_s: REST_S,
-    })
+    }
 }
 
 /// An operator on `link` that replays the unseen performance.

@@ -1,5 +1,7 @@
 //! What the operator tells: lines for people, JSON lines for machines.
 
+use std::path::PathBuf;
+
 use indicatif::{ProgressBar, ProgressStyle};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
@@ -160,6 +162,7 @@ pub enum Event {
     },
     Connected {
         epoch: u32,
+        version: u16,
     },
     Lost {
         why: String,
@@ -206,6 +209,23 @@ pub enum Event {
         demonstrations_to_tip: Option<Scores>,
         turn_to_tip: Option<TurnScores>,
     },
+    Performed {
+        number: u32,
+        zero_mono_ns: i64,
+    },
+    Kept {
+        name: String,
+    },
+    Refined {
+        skill: String,
+        id: String,
+        demonstrations: usize,
+        bytes: usize,
+        learned: Vec<(String, f64)>,
+    },
+    Saved {
+        file: PathBuf,
+    },
     Done {
         completed: bool,
         why: Option<String>,
@@ -213,6 +233,7 @@ pub enum Event {
         epoch_mono_ns: i64,
         samples: u32,
         samples_at_rest: u32,
+        glitches: u32,
         messages: u32,
         knots: u32,
         sessions: u32,
@@ -224,7 +245,7 @@ pub enum Event {
 }
 
 impl Event {
-    pub(super) fn done(summary: &Summary, task: &Task, epoch: Mono) -> Self {
+    pub(super) fn done(summary: &Summary, task: &Task, epoch: Mono, latency_s: f64) -> Self {
         let why = match &summary.outcome {
             Outcome::Completed => None,
             Outcome::Interrupted(why) => Some(why.clone()),
@@ -234,10 +255,13 @@ impl Event {
         Self::Done {
             completed: why.is_none(),
             why,
-            zero_mono_ns: task.zero().map(|t| t.0 + epoch.0),
+            zero_mono_ns: task
+                .zero()
+                .map(|t| t.offset_by_secs(-latency_s).0 + epoch.0),
             epoch_mono_ns: epoch.0,
             samples: summary.counters.samples,
             samples_at_rest: summary.counters.rest_samples,
+            glitches: summary.counters.glitches,
             messages: summary.counters.messages,
             knots: summary.counters.knots,
             sessions: summary.sessions,
@@ -287,7 +311,7 @@ impl Event {
                 ))
             ),
             Self::Dialling { why } => format!("dialling: {why}"),
-            Self::Connected { epoch } => format!("connected (session {epoch})"),
+            Self::Connected { epoch, .. } => format!("connected (session {epoch})"),
             Self::Lost { why } => format!("link lost: {why}"),
             Self::Mapping {
                 robot,
@@ -357,8 +381,29 @@ impl Event {
                 }
                 text
             }
+            // With one performance, the line at the end says all.
+            Self::Performed { .. } => return None,
+            Self::Kept { name } => format!("kept as {name}"),
+            Self::Refined {
+                skill,
+                id,
+                demonstrations,
+                learned,
+                ..
+            } => {
+                let novel: Vec<_> = learned
+                    .iter()
+                    .map(|(name, novel)| format!("{name} ({:.0} % new)", novel * 1e2))
+                    .collect();
+                format!(
+                    "refined {skill} with {}: {demonstrations} demonstrations now, id {id}",
+                    novel.join(", ")
+                )
+            }
+            Self::Saved { file } => format!("saved {}", file.display()),
             Self::Done {
                 samples,
+                glitches,
                 messages,
                 knots,
                 bytes_on_wire,
@@ -367,7 +412,12 @@ impl Event {
                 ..
             } => format!(
                 "{samples} samples in {messages} messages with {knots} path knots: {bytes_on_wire} B on the wire \
-                 (and {bytes_session_up} B up, {bytes_session_down} B down for the session)"
+                 (and {bytes_session_up} B up, {bytes_session_down} B down for the session){}",
+                if *glitches > 0 {
+                    format!("; {glitches} glitches replaced")
+                } else {
+                    String::new()
+                }
             ),
         })
     }
@@ -422,7 +472,10 @@ pub(super) async fn listen_to(
         }
         let event = match notice {
             Notice::Dialling { why } => Event::Dialling { why },
-            Notice::Connected { epoch } => Event::Connected { epoch },
+            Notice::Connected { epoch, version } => Event::Connected {
+                epoch,
+                version: version.number(),
+            },
             Notice::Lost { why } => Event::Lost { why },
             Notice::Mapping {
                 scale,
@@ -438,6 +491,19 @@ pub(super) async fn listen_to(
                 Event::Progress { done }
             }
             Notice::Note(text) => Event::Note { text: text.into() },
+            Notice::Performed { number, zero } => Event::Performed {
+                number,
+                zero_mono_ns: zero.0 + epoch.0,
+            },
+            Notice::Kept(name) => Event::Kept { name },
+            Notice::Refined { skill, learned } => Event::Refined {
+                skill: skill.name().to_owned(),
+                id: skill.id().to_string(),
+                demonstrations: skill.parts().provenance.sources.len(),
+                bytes: skill.to_bytes().len(),
+                learned,
+            },
+            Notice::Saved(file) => Event::Saved { file },
             Notice::Event(at, event) => match event {
                 session::Event::Ready => continue,
                 session::Event::Engaged { engagement, .. } => Event::Engaged {

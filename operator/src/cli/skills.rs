@@ -1,6 +1,6 @@
 //! The skills an operator has, learned now or loaded, and what to do with them.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context, bail};
@@ -43,7 +43,7 @@ impl Skills {
         for dir in &args.learn {
             let found = Demonstrations::read_dir(dir, args.matching.as_deref())?;
             found.notices.iter().for_each(|notice| log.note(notice));
-            let kept = keep_unseen(found.demonstrations, args.replay.as_deref(), log)?;
+            let kept = keep_unseen(found.demonstrations, &args.replay, log)?;
             if kept.is_empty() {
                 bail!(
                     "{}: nothing is left to learn from without the replayed recording",
@@ -178,18 +178,19 @@ fn frames_asked(args: &Args) -> Vec<String> {
     frames
 }
 
-/// Leaves out the recording that will be replayed, by path and by content.
+/// Leaves out the recordings that will be replayed, by path and by content.
 fn keep_unseen(
     all: Vec<Demonstration>,
-    replay: Option<&Path>,
+    replay: &[PathBuf],
     log: &Log,
 ) -> anyhow::Result<Vec<Demonstration>> {
-    let Some(path) = replay else { return Ok(all) };
-    let replayed = Demonstration::read_csv(path)?;
+    let replayed = replay.iter().map(Demonstration::read_csv);
+    let replayed = replayed.collect::<Result<Vec<_>, _>>()?;
     let place = |p: &Path| std::fs::canonicalize(p).unwrap_or_else(|_| p.to_owned());
-    let (same, kept): (Vec<_>, Vec<_>) = all
-        .into_iter()
-        .partition(|d| d.sha256() == replayed.sha256() || place(d.path()) == place(path));
+    let (same, kept): (Vec<_>, Vec<_>) = all.into_iter().partition(|d| {
+        let is = |r: &Demonstration| d.sha256() == r.sha256() || place(d.path()) == place(r.path());
+        replayed.iter().any(is)
+    });
     for demonstration in same {
         log.note(&format!(
             "{} is replayed: it is not learned from",

@@ -11,7 +11,7 @@ use telemime_protocol::time::Stamp;
 
 use super::trial::{self, Split, TrialError, TrialOptions};
 use super::*;
-use crate::demonstration::{Demonstration, Demonstrations, Sample};
+use crate::demonstration::{Demonstration, Demonstrations, PersonPattern, Sample};
 use crate::learn::predictor::states;
 use crate::learn::{LearnOptions, PredictorOptions, learn_skill};
 
@@ -301,6 +301,7 @@ fn trial_options(split: Split) -> TrialOptions {
         recognise: RecogniseOptions::default(),
         learn: quick(),
         split,
+        persons: PersonPattern::default(),
         at_s: 0.7,
         also_at_s: vec![0.3],
     }

@@ -11,12 +11,12 @@ use rayon::prelude::*;
 use telemime_protocol::skill::Skill;
 
 use super::{RecogniseError, RecogniseOptions, Recogniser, Verdict};
-use crate::demonstration::{Demonstration, Demonstrations};
+use crate::demonstration::{Demonstration, Demonstrations, PersonPattern};
 use crate::learn::align::align;
 use crate::learn::predictor::states;
 use crate::learn::{LearnError, LearnOptions, learn_skill};
 
-pub use rounds::{Split, person};
+pub use rounds::Split;
 pub use score::{Operating, Report, SkillReport};
 
 use rounds::Round;
@@ -33,6 +33,8 @@ pub struct TrialOptions {
     pub learn: LearnOptions,
     /// What is held out.
     pub split: Split,
+    /// Where file names hold the person.
+    pub persons: PersonPattern,
     /// When to ask, s after the onset: what the matrix shows.
     pub at_s: f64,
     /// When else to ask.
@@ -64,21 +66,26 @@ pub enum TrialError {
     },
     /// Nothing can be held out in this way.
     #[error(
-        "{name}: all demonstrations are by one person ({person:?}), as the file names have it (gesture_person_trial): \
-         hold out demonstrations instead"
+        "{name}: all demonstrations are by one person ({person:?}), as {pattern} finds them in the file names: \
+         hold out demonstrations instead, or say with --group-by where the names hold the person"
     )]
     Persons {
         /// The skill.
         name: String,
         /// The person.
         person: String,
+        /// Where persons were looked for.
+        pattern: String,
     },
     /// No person performs two skills, each at least twice.
     #[error(
-        "no person, as the file names have it (gesture_person_trial), performs two skills twice each: \
-         hold out demonstrations instead"
+        "no person, as {pattern} finds them in the file names, performs two skills twice each: \
+         hold out demonstrations instead, or say with --group-by where the names hold the person"
     )]
-    NobodysOwn,
+    NobodysOwn {
+        /// Where persons were looked for.
+        pattern: String,
+    },
     /// A moment to ask is not a time.
     #[error("asked {at_s} s after the onset: 0 s or more is possible")]
     Moment {
@@ -157,7 +164,7 @@ pub fn run(
     if let Some(&at_s) = asked_s.iter().find(|t| !(**t >= 0.0)) {
         return Err(TrialError::Moment { at_s });
     }
-    let rounds = rounds::rounds(sets, options.split)?;
+    let rounds = rounds::rounds(sets, options.split, &options.persons)?;
     // A wrong option should not be found out after minutes of learning.
     Recogniser::new([], options.recognise)?;
     let phases = sets

@@ -3,6 +3,7 @@
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_protocol::skill::Stats;
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::Versions;
 use telemime_protocol::wire::v1::Info;
 
 /// How far the robot's prediction may be off before the operator speaks.
@@ -27,12 +28,18 @@ pub struct SessionConfig {
     pub future_bound: FutureBound,
     /// ε_path, m; `None` is 2 % of the skill's reach.
     pub path_bound_m: Option<f64>,
+    /// The input's own latency, s: how long after it was valid a sample is handed over. It is subtracted from the sample's time.
+    pub input_latency_s: f64,
+    /// What a tracker gets wrong for a frame or two is replaced by its prediction.
+    pub glitch_gate: bool,
     /// Prediction gain κ in [0, 1].
     pub gain: f64,
     /// Tip metres per hand metre; `None` derives it from the demonstrations and the arm's limits.
     pub scale: Option<f64>,
     /// Hand axes to the robot's base axes.
     pub rotation: UnitQuaternion<f64>,
+    /// The protocol versions this operator offers.
+    pub versions: Versions,
 }
 
 impl Default for SessionConfig {
@@ -43,9 +50,12 @@ impl Default for SessionConfig {
             lease_s: 0.65,
             future_bound: FutureBound::Relative(0.6),
             path_bound_m: None,
+            input_latency_s: 0.0,
+            glitch_gate: true,
             gain: 1.0,
             scale: None,
             rotation: UnitQuaternion::identity(),
+            versions: Versions::default(),
         }
     }
 }
@@ -53,7 +63,7 @@ impl Default for SessionConfig {
 /// The hand at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HandSample {
-    /// When it is valid.
+    /// When it is handed over: it is valid [`SessionConfig::input_latency_s`] earlier.
     pub t: Stamp,
     /// Position, m.
     pub x: Vector3<f64>,

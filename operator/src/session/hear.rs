@@ -66,7 +66,7 @@ impl Session {
                 {
                     mirror.go_without_model();
                 } else {
-                    self.activity = Activity::Nothing;
+                    self.let_go();
                     // What was sent for nothing is not what following took.
                     if let Some(before) = self.before.take() {
                         let dropped = self.counters.dropped;
@@ -97,8 +97,10 @@ impl Session {
                     t1_us,
                     t2_us: t_us,
                     t3_us: t_us,
-                    external: self.external,
                 });
+                if let Some(clock) = self.external {
+                    self.datagram(&OperatorDatagram::Clock { epoch, clock });
+                }
             }
             Ok(RobotDatagram::Telemetry(telemetry)) if telemetry.epoch == self.epoch => {
                 if let Activity::Mirror(mirror) = &mut self.activity
@@ -141,11 +143,11 @@ impl Session {
         match state {
             RobotState::Stopped => {
                 self.next_stop = None;
-                self.activity = Activity::Nothing;
+                self.let_go();
             }
             // The robot let go by itself: the clutch must be pressed again.
-            RobotState::Holding => self.activity = Activity::Nothing,
-            RobotState::Ready if cause == Cause::PlanFinished => self.activity = Activity::Nothing,
+            RobotState::Holding => self.let_go(),
+            RobotState::Ready if cause == Cause::PlanFinished => self.let_go(),
             _ => {}
         }
         self.events.push_back(Event::State(state, cause));

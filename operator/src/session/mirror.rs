@@ -12,9 +12,10 @@ use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::v1::{Drive, MAX_TAIL_KNOTS, Motion, PathTail, model_tag};
 
-use super::FutureBound;
 use super::adapt::Adaptation;
+use super::gate::Taken;
 use super::hand::{Hand, Known, Travelling};
+use super::{FutureBound, HandSample};
 
 /// Knots in one message; the oldest unacknowledged first.
 const KNOTS_PER_MESSAGE: usize = 24;
@@ -46,6 +47,15 @@ const PATIENCE_S: f64 = 0.15;
 /// A hand that is not moving when it engages has rested: the arm must not begin what the person has not begun, s.
 const RESTED_S: f64 = 10.0;
 
+/// What is kept of an engagement, in samples: half an hour of a tracker of 60 Hz. What comes later is not.
+const MOST_DRIVEN: usize = 108_000;
+
+/// A sample that its prediction stands for, for the time being.
+struct Suspect {
+    seen: HandSample,
+    instead: Vector3<f64>,
+}
+
 /// A knot the robot may not have yet.
 struct Unacknowledged {
     knot: PathKnot,
@@ -56,6 +66,10 @@ struct Unacknowledged {
 /// A live engagement.
 pub(super) struct Mirror {
     hand: Hand,
+    /// The hand at the last sample that was what the hand did.
+    judged: Hand,
+    suspects: Vec<Suspect>,
+    driven: Vec<HandSample>,
     path: PathEncoder,
     code: PathCode,
     /// The last knots the robot holds: those to come are written with them in mind.
@@ -83,6 +97,9 @@ impl Mirror {
         let path = PathEncoder::new(path_bound_m)?;
         Ok(Self {
             hand,
+            judged: hand,
+            suspects: Vec::new(),
+            driven: Vec::new(),
             code: PathCode {
                 grid: path.grid(),
                 sample_us,
@@ -143,9 +160,42 @@ impl Mirror {
         self.first_unacknowledged += known as u32;
     }
 
-    /// Takes the newest hand state; says whether a knot was made.
-    pub(super) fn take(&mut self, previous: &Hand, hand: Hand, skill: Option<&Skill>) -> bool {
+    /// By what the hand is predicted now, place and orientation.
+    pub(super) fn params(&self) -> (Params, Params) {
+        let turn = self.hand.turn.as_ref();
+        (
+            self.places.params(&self.hand.place),
+            turn.map_or(Params::DEFAULT, |turn| self.turns.params(turn)),
+        )
+    }
+
+    /// What the hand did.
+    pub(super) fn into_driven(mut self: Box<Self>) -> Vec<HandSample> {
+        std::mem::take(&mut self.driven)
+    }
+
+    /// Takes the newest hand state, which `sample` led to as `taken` says. Returns how many knots were made.
+    ///
+    /// The future is urgent and believes the gate at once. The path is complete, and adaptation wants the truth:
+    /// both wait until it is known what a replaced sample was.
+    pub(super) fn take(
+        &mut self,
+        sample: &HandSample,
+        taken: Taken,
+        hand: Hand,
+        skill: Option<&Skill>,
+    ) -> u32 {
         self.hand = hand;
+        if taken == Taken::Replaced {
+            self.suspects.push(Suspect {
+                seen: *sample,
+                instead: hand.place.x,
+            });
+            let skill = skill.filter(|_| !self.without_model);
+            self.newest = self.travelling().map(|t| t.known(skill));
+            return 0;
+        }
+        let previous = std::mem::replace(&mut self.judged, hand);
         let skill = skill.filter(|_| !self.without_model);
         let model = skill.map(Skill::predictor);
         self.places.observe(&previous.place, &hand.place, model);
@@ -154,12 +204,36 @@ impl Mirror {
             self.turns.observe(previous, turn, model);
         }
         self.newest = self.travelling().map(|t| t.known(skill));
+        let knots = self.settle(taken == Taken::Rewritten);
+        self.record(sample);
+        knots + self.trace(hand.place.t, hand.place.x)
+    }
+
+    /// What the suspects were is known: the hand's doing, or glitches. Returns how many knots that made.
+    fn settle(&mut self, real: bool) -> u32 {
+        let mut knots = 0;
+        for Suspect { seen, instead } in std::mem::take(&mut self.suspects) {
+            knots += self.trace(seen.t, if real { seen.x } else { instead });
+            if real {
+                self.record(&seen);
+            }
+        }
+        knots
+    }
+
+    fn record(&mut self, sample: &HandSample) {
+        if !sample.resting && self.driven.len() < MOST_DRIVEN {
+            self.driven.push(*sample);
+        }
+    }
+
+    fn trace(&mut self, t: Stamp, x: Vector3<f64>) -> u32 {
         // A sample the path cannot hold (out of the grid's range) is still good for the future.
-        let Ok(Some(knot)) = self.path.push(hand.place.t, hand.place.x) else {
-            return false;
+        let Ok(Some(knot)) = self.path.push(t, x) else {
+            return 0;
         };
         self.hold(knot);
-        true
+        1
     }
 
     fn hold(&mut self, knot: PathKnot) {
@@ -179,10 +253,11 @@ impl Mirror {
         }
     }
 
-    /// Closes the path at the newest sample; says whether that took another knot.
-    pub(super) fn close(&mut self) -> bool {
+    /// Closes the path at the newest sample; returns how many knots that took.
+    pub(super) fn close(&mut self) -> u32 {
+        let settled = self.settle(false);
         let last = self.path.flush();
-        last.map(|knot| self.hold(knot)).is_some()
+        settled + u32::from(last.map(|knot| self.hold(knot)).is_some())
     }
 
     /// The oldest unacknowledged knots for the stream but for the engagement, `None` if there are none. What is
@@ -306,10 +381,7 @@ impl Mirror {
 
     /// The newest of the hand as it would travel now.
     fn travelling(&self) -> Option<Travelling> {
-        let turn = match &self.hand.turn {
-            Some(turn) => self.turns.params(turn),
-            None => Params::DEFAULT,
-        };
-        Travelling::new(&self.hand, &self.places.params(&self.hand.place), &turn)
+        let (place, turn) = self.params();
+        Travelling::new(&self.hand, &place, &turn)
     }
 }

@@ -5,6 +5,7 @@
 
 pub mod adapt;
 mod config;
+mod gate;
 mod hand;
 mod hear;
 mod mirror;
@@ -16,8 +17,10 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use telemime_protocol::checkpoint::PosePlan;
+use telemime_protocol::predict::Params;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::Version;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::v1::{
     Drive, Engage, ExternalClock, Info, Message, OperatorControl, OperatorDatagram, PathTail,
@@ -29,6 +32,7 @@ use crate::recognise::{Recogniser, Verdict};
 pub use config::{FutureBound, HandSample, SessionConfig, default_scale};
 pub use said::{Counters, Event, Output};
 
+use gate::{Gate, Taken};
 use hand::{Hand, Interval};
 use mirror::Mirror;
 
@@ -51,13 +55,19 @@ enum Activity {
 /// One session with a robot.
 pub struct Session {
     config: SessionConfig,
+    version: Version,
     epoch: u32,
     skill: Option<Arc<Skill>>,
     info: Option<Info>,
     model_stored: bool,
+    /// Takes the skill's place as soon as nothing is driven.
+    next_skill: Option<Arc<Skill>>,
+    /// What was driven last.
+    driven: Vec<HandSample>,
     state: RobotState,
     changes: u32,
     hand: Option<Hand>,
+    gate: Gate,
     interval: Interval,
     recogniser: Option<Recogniser>,
     external: Option<ExternalClock>,
@@ -83,13 +93,17 @@ impl Session {
     pub fn new(config: SessionConfig, skill: Option<Arc<Skill>>, epoch: u32) -> Self {
         Self {
             config,
+            version: Version::V1,
             epoch,
             skill,
             info: None,
             model_stored: false,
+            next_skill: None,
+            driven: Vec::new(),
             state: RobotState::Idle,
             changes: 0,
             hand: None,
+            gate: Gate::default(),
             interval: Interval::default(),
             recogniser: None,
             external: None,
@@ -107,6 +121,13 @@ impl Session {
             outputs: VecDeque::new(),
             events: VecDeque::new(),
         }
+    }
+
+    /// Speaks `version` instead of version 1.
+    #[must_use]
+    pub fn speaking(mut self, version: Version) -> Self {
+        self.version = version;
+        self
     }
 
     /// Reports with [`Event::Recognised`] which of these skills the hand performs, whenever that changes. It
@@ -167,33 +188,49 @@ impl Session {
     }
 
     /// The hand, live. Samples out of order or not finite are dropped and counted.
-    pub fn handle_sample(&mut self, now: Stamp, sample: HandSample) {
+    pub fn handle_sample(&mut self, now: Stamp, mut sample: HandSample) {
+        sample.t = sample.t.offset_by_secs(-self.config.input_latency_s);
         let Some(hand) = &mut self.hand else {
             self.hand = Hand::first(&sample);
             return;
         };
         let previous = *hand;
-        if !hand.advance(&sample) {
+        let suspects = self.gate.suspects() as u32;
+        let taken = if self.config.glitch_gate {
+            let skill = self.skill.as_deref();
+            let params = match &self.activity {
+                Activity::Mirror(mirror) => mirror.params(),
+                Activity::Nothing | Activity::Play { .. } => (Params::DEFAULT, Params::DEFAULT),
+            };
+            self.gate.take(hand, &sample, skill, (&params.0, &params.1))
+        } else {
+            hand.advance(&sample).then_some(Taken::Real)
+        };
+        let Some(taken) = taken else {
             self.counters.dropped += 1;
             return;
-        }
+        };
         let hand = *hand;
         self.interval
             .take(hand.place.t.secs_since(previous.place.t));
         self.recognise(&hand);
+        let network_s = self.network_delay_s();
         let Activity::Mirror(mirror) = &mut self.activity else {
             return;
         };
         let skill = self.skill.as_deref().filter(|_| self.model_stored);
         let lag_s = self.info.as_ref().map_or(0.0, |info| f64::from(info.lag_s));
+        if taken == Taken::Real {
+            self.counters.glitches += suspects;
+        }
         if sample.resting {
             self.counters.rest_samples += 1;
         } else {
             self.counters.samples += 1;
         }
-        self.counters.knots += u32::from(mirror.take(&previous, hand, skill));
+        self.counters.knots += mirror.take(&sample, taken, hand, skill);
         let backlog = mirror.backlog();
-        let arrival = now.offset_by_secs(self.delay_s + lag_s);
+        let arrival = now.offset_by_secs(network_s + lag_s);
         let silent_s = now.secs_since(self.last_sent);
         if mirror.future_changed(arrival, self.config.future_bound)
             || silent_s >= self.config.max_silence_s
@@ -207,6 +244,11 @@ impl Session {
         if let Some(tail) = backlog {
             self.path(tail);
         }
+    }
+
+    /// What the robot calls delay is the age of a sample: the input's latency and the network's.
+    fn network_delay_s(&self) -> f64 {
+        (self.delay_s - self.config.input_latency_s).max(0.0)
     }
 
     fn recognise(&mut self, hand: &Hand) {
@@ -277,7 +319,7 @@ impl Session {
     /// Lets go of the clutch, and sees to it that the robot holds the path up to the newest sample.
     pub fn release(&mut self) {
         if let Activity::Mirror(mirror) = &mut self.activity {
-            self.counters.knots += u32::from(mirror.close());
+            self.counters.knots += mirror.close();
             while let Activity::Mirror(mirror) = &mut self.activity
                 && let Some(tail) = mirror.tail()
             {
@@ -288,13 +330,13 @@ impl Session {
             self.control(&OperatorControl::Release {
                 engagement: self.engagement,
             });
-            self.activity = Activity::Nothing;
+            self.let_go();
         }
     }
 
     /// Emergency stop: on the stream, and by datagram until the robot says it has stopped.
     pub fn stop(&mut self, now: Stamp) {
-        self.activity = Activity::Nothing;
+        self.let_go();
         self.control(&OperatorControl::EmergencyStop);
         self.next_stop = Some(now);
     }
@@ -354,6 +396,44 @@ impl Session {
         }
     }
 
+    /// What the hand did in the engagement that ended last, glitches left out; empty if there was none.
+    pub fn driven(&self) -> &[HandSample] {
+        &self.driven
+    }
+
+    /// Goes on with `skill`. Nobody's model changes while the arm follows: what is being driven ends with the
+    /// one it began with, and only then does this one travel; until the robot holds it, [`Session::is_ready`]
+    /// is false.
+    pub fn replace_skill(&mut self, skill: Arc<Skill>) {
+        self.next_skill = Some(skill);
+        if matches!(self.activity, Activity::Nothing) {
+            self.adopt();
+        }
+    }
+
+    fn adopt(&mut self) {
+        let Some(skill) = self.next_skill.take() else {
+            return;
+        };
+        let (id, bytes) = (skill.id().0, skill.to_bytes().to_vec());
+        self.skill = Some(skill);
+        self.model_stored = false;
+        // Before the robot has introduced itself nobody knows what it holds; then it is told.
+        if self.info.is_some() {
+            self.control(&OperatorControl::Model { id, bytes });
+        }
+    }
+
+    /// Nothing is driven any more.
+    fn let_go(&mut self) {
+        if let Activity::Mirror(mirror) = std::mem::replace(&mut self.activity, Activity::Nothing)
+            && self.before.is_none()
+        {
+            self.driven = mirror.into_driven();
+        }
+        self.adopt();
+    }
+
     fn next_word(&self) -> Option<Stamp> {
         match self.activity {
             Activity::Nothing | Activity::Play { engaged: false, .. } => None,
@@ -375,6 +455,7 @@ impl Session {
         self.urgent = false;
         self.seq += 1;
         let lease_ms = (self.config.lease_s * 1e3) as u16;
+        let network_s = self.network_delay_s();
         let datagram = match &mut self.activity {
             Activity::Nothing => return,
             Activity::Play { .. } => OperatorDatagram::Go {
@@ -386,7 +467,7 @@ impl Session {
             },
             Activity::Mirror(mirror) => {
                 let skill = self.skill.as_deref().filter(|_| self.model_stored);
-                let Some(mut motion) = mirror.motion(skill, now, self.delay_s) else {
+                let Some(mut motion) = mirror.motion(skill, now, network_s) else {
                     return;
                 };
                 motion.epoch = self.epoch;
@@ -398,7 +479,7 @@ impl Session {
         };
         self.counters.messages += 1;
         self.outputs.push_back(Output::Datagram {
-            bytes: datagram.encode(),
+            bytes: self.version.encode_operator_datagram(&datagram),
             motion: true,
         });
     }
@@ -444,7 +525,7 @@ impl Session {
 
     fn datagram(&mut self, message: &OperatorDatagram) {
         self.outputs.push_back(Output::Datagram {
-            bytes: message.encode(),
+            bytes: self.version.encode_operator_datagram(message),
             motion: false,
         });
     }

@@ -68,6 +68,8 @@ pub struct Counters {
     pub messages: u32,
     /// Path knots made.
     pub knots: u32,
+    /// Samples replaced by their prediction, and not taken back.
+    pub glitches: u32,
     /// Datagrams dropped.
     pub dropped: u32,
 }
@@ -79,6 +81,7 @@ impl Counters {
         self.rest_samples += other.rest_samples;
         self.messages += other.messages;
         self.knots += other.knots;
+        self.glitches += other.glitches;
         self.dropped += other.dropped;
     }
 }

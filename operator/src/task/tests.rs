@@ -116,3 +116,64 @@ fn after_a_hold_or_a_stop_nothing_is_asked_again() {
         assert!(now > at(1900), "the samples go on: {now:?}");
     }
 }
+
+/// Lets the shell's clock run until the task says something else than go on.
+fn until_said(task: &mut Task, session: &mut Session, now: &mut Stamp) -> Advice {
+    loop {
+        let advice = task.advise(*now, session);
+        if task.phase == Phase::Asked {
+            let engaged = Event::Engaged {
+                engagement: 1,
+                t_us: 0,
+                hand_m: [0.0; 3],
+                tip_m: [0.0; 3],
+                hand_q: None,
+                tip_q: nalgebra::UnitQuaternion::identity(),
+            };
+            task.on_event(*now, &engaged);
+        }
+        if advice != Advice::Continue {
+            return advice;
+        }
+        *now = task.poll_timeout().unwrap();
+    }
+}
+
+#[test]
+fn recordings_follow_one_another_when_they_may() {
+    let Work::Replay { recording, .. } = replay().work else {
+        panic!("a replay")
+    };
+    let (mut task, mut session) = (replay().and_then(recording), ready());
+    let mut now = at(0);
+    let said = until_said(&mut task, &mut session, &mut now);
+    assert_eq!(said, Advice::Performed);
+    let first = task.zero().unwrap();
+    assert_eq!(task.advise(now, &mut session), Advice::Between, "said once");
+    assert_eq!(task.poll_timeout(), None, "it waits to be told");
+    assert!(!task.is_over(at(3_600_000)), "one is left");
+    task.go_on();
+    assert_eq!(
+        until_said(&mut task, &mut session, &mut now),
+        Advice::Performed
+    );
+    assert!(task.zero().unwrap().secs_since(first) > 2.0);
+    task.go_on();
+    assert_eq!(task.advise(now, &mut session), Advice::Finished);
+    assert_eq!(task.outcome(false), Outcome::Completed);
+}
+
+#[test]
+fn a_stop_between_two_recordings_ends_the_task() {
+    let Work::Replay { recording, .. } = replay().work else {
+        panic!("a replay")
+    };
+    let (mut task, mut session) = (replay().and_then(recording), ready());
+    let mut now = at(0);
+    until_said(&mut task, &mut session, &mut now);
+    task.on_event(now, &Event::State(RobotState::Stopped, Cause::LocalStop));
+    assert!(task.is_in_trouble());
+    task.go_on();
+    assert_eq!(task.advise(now, &mut session), Advice::Finished);
+    assert!(matches!(task.outcome(false), Outcome::Interrupted(_)));
+}

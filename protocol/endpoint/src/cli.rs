@@ -8,6 +8,7 @@ use std::thread;
 use std::time::Duration;
 
 use serde::Serialize;
+use telemime_protocol::wire::{Version, Versions};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{mpsc, watch};
 
@@ -38,6 +39,27 @@ pub fn resolve(text: &str) -> Result<SocketAddr, String> {
     first
         .copied()
         .ok_or_else(|| format!("`{text}` has no address"))
+}
+
+/// `--protocol-max` names a version this build does not know.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("--protocol-max {number}: this build knows protocol version 1, and 2 as an experiment")]
+pub struct UnknownVersion {
+    /// The number given.
+    pub number: u16,
+}
+
+/// The protocol versions of `--protocol-max`: from 1 to it, and 1 alone without it.
+///
+/// # Errors
+/// [`UnknownVersion`].
+pub fn versions(highest: Option<u16>) -> Result<Versions, UnknownVersion> {
+    let Some(number) = highest else {
+        return Ok(Versions::default());
+    };
+    Version::from_number(number)
+        .and_then(|highest| Versions::new(Version::V1, highest))
+        .ok_or(UnknownVersion { number })
 }
 
 /// An error and its causes in one line, each said once: a cause that the text before it quotes is left out.
@@ -112,18 +134,24 @@ impl Printing {
 }
 
 /// A word typed at a daemon's terminal.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Word {
     /// `stop`: emergency stop.
     Stop,
     /// `reset`: leave the latched stop.
     Reset,
-    /// `pair` or `pair 30s`: open a pairing window (robot).
+    /// `pair` or `pair 30s`: open a pairing window.
     Pair(Duration),
     /// `yes`: the codes are the same.
     Yes,
     /// `no`: they are not.
     No,
+    /// `keep`: the performance just driven is worth learning from.
+    Keep,
+    /// `refine`: learn from what was kept.
+    Refine,
+    /// `save FILE`: write the skill as it is now.
+    Save(PathBuf),
 }
 
 /// How long a window is open that was asked for without saying how long.
@@ -132,18 +160,33 @@ pub const PAIRING_WINDOW: Duration = Duration::from_secs(60);
 /// The longest pairing window.
 pub const LONGEST_WINDOW: Duration = Duration::from_secs(600);
 
-/// What a line typed at a terminal means.
-fn word(line: &str) -> Option<Word> {
-    let mut parts = line.split_whitespace();
-    let word = match parts.next()? {
-        "stop" => Word::Stop,
-        "reset" => Word::Reset,
-        "yes" => Word::Yes,
-        "no" => Word::No,
-        "pair" => Word::Pair(parts.next().map_or(Ok(PAIRING_WINDOW), seconds).ok()?),
-        _ => return None,
-    };
-    parts.next().is_none().then_some(word)
+/// What a robot's terminal understands.
+pub const ROBOT_WORDS: &str = "stop, reset, pair, yes, no or quit";
+
+/// What an operator's terminal understands.
+pub const OPERATOR_WORDS: &str = "stop, reset, keep, refine, save FILE or quit";
+
+impl Word {
+    /// The word of a line, if it is one of `known` ([`ROBOT_WORDS`], [`OPERATOR_WORDS`]).
+    fn parse(line: &str, known: &str) -> Option<Self> {
+        let (word, rest) = line.split_once(' ').unwrap_or((line, ""));
+        let mut listed = known.split([' ', ',']);
+        if !listed.any(|listed| listed == word) {
+            return None;
+        }
+        match (word, rest.trim()) {
+            ("stop", "") => Some(Self::Stop),
+            ("reset", "") => Some(Self::Reset),
+            ("pair", "") => Some(Self::Pair(PAIRING_WINDOW)),
+            ("pair", span) => seconds(span).ok().map(Self::Pair),
+            ("yes", "") => Some(Self::Yes),
+            ("no", "") => Some(Self::No),
+            ("keep", "") => Some(Self::Keep),
+            ("refine", "") => Some(Self::Refine),
+            ("save", file) if !file.is_empty() => Some(Self::Save(file.into())),
+            _ => None,
+        }
+    }
 }
 
 /// A length of time of whole or broken seconds: `60s`, `60` or `0.5s`; at most ten minutes.
@@ -180,14 +223,14 @@ pub async fn told(quit: &mut watch::Receiver<bool>) {
     let _ = quit.wait_for(|quit| *quit).await;
 }
 
-/// Ctrl-C, SIGTERM, `quit`, or (if asked for) the end of stdin turn the watch true; the other words arrive as
-/// such; what is none is answered with `help` (`stop` is also called at once, on the reading thread). stdin is read only when it is a terminal or `follow_stdin` is set.
+/// Ctrl-C, SIGTERM, `quit`, or (if asked for) the end of stdin turn the watch true; the other words of `known`
+/// arrive as such (`stop` is also called at once, on the reading thread). stdin is read only when it is a terminal or `follow_stdin` is set.
 ///
 /// # Errors
 /// The system's, if signals cannot be caught.
 pub fn listen(
     follow_stdin: bool,
-    help: &'static str,
+    known: &'static str,
     stop: impl Fn() + Send + 'static,
 ) -> io::Result<(watch::Receiver<bool>, mpsc::UnboundedReceiver<Word>)> {
     let (quit_tx, quit) = watch::channel(false);
@@ -208,18 +251,18 @@ pub fn listen(
         // A thread of its own, never joined: a blocking read cannot be cancelled, and ends with the process.
         thread::Builder::new().name("stdin".into()).spawn(move || {
             for line in io::stdin().lock().lines().map_while(Result::ok) {
-                if line.trim() == "quit" {
+                let line = line.trim();
+                if line == "quit" {
                     break;
                 }
-                match word(&line) {
-                    Some(word) => {
-                        if word == Word::Stop {
-                            stop();
-                        }
-                        let _ = word_tx.send(word);
-                    }
-                    None => eprintln!("{help}"),
+                let Some(word) = Word::parse(line, known) else {
+                    eprintln!("{known}?");
+                    continue;
+                };
+                if word == Word::Stop {
+                    stop();
                 }
+                let _ = word_tx.send(word);
             }
             quit_tx.send_replace(true);
         })?;
@@ -238,6 +281,21 @@ mod tests {
     #[error("key.pem: {source}")]
     struct Quoting {
         source: std::io::Error,
+    }
+
+    #[test]
+    fn words_are_those_the_terminal_knows() {
+        let said = |line| Word::parse(line, OPERATOR_WORDS);
+        assert_eq!(said("stop"), Some(Word::Stop));
+        assert_eq!(
+            said("save  my swing.skill"),
+            Some(Word::Save("my swing.skill".into()))
+        );
+        for line in ["", "save", "stop it", "FILE", "or", "stopp"] {
+            assert_eq!(said(line), None, "{line}");
+        }
+        assert_eq!(Word::parse("keep", ROBOT_WORDS), None);
+        assert_eq!(Word::parse("reset", ROBOT_WORDS), Some(Word::Reset));
     }
 
     #[test]
@@ -280,7 +338,7 @@ mod tests {
             ("pair soon", None),
             ("pair nan", None),
         ] {
-            assert_eq!(word(line), meant, "{line}");
+            assert_eq!(Word::parse(line.trim(), ROBOT_WORDS), meant, "{line}");
         }
     }
 }

@@ -37,6 +37,13 @@ const SEND_WINDOW: u64 = 32 * 1024;
 /// Datagrams QUIC may hold back: two of ours, each with quinn's 32 B of bookkeeping. The newest wins.
 const DATAGRAM_SEND_BUFFER: usize = 2 * (v1::MAX_DATAGRAM_LEN + 32);
 
+/// Stream bytes held for a session that does not read them yet, twice what this implementation has under way.
+const RECEIVE_WINDOW: u32 = 64 * 1024;
+
+/// First packets held for somebody who has not been let in, bytes: a client's hello, and some of it again. quinn's
+/// 10 MiB are for servers that want 0-RTT.
+const INCOMING_BUFFER: u64 = 8 * 1024;
+
 /// Cubic that never closes its window below [`WINDOW_FLOOR`].
 ///
 /// Cubic does not grow while the application sends little, and quinn sends nothing while
@@ -127,6 +134,8 @@ fn transport() -> TransportConfig {
         .send_window(SEND_WINDOW)
         .datagram_send_buffer_size(DATAGRAM_SEND_BUFFER)
         .datagram_receive_buffer_size(Some(64 * 1024))
+        .stream_receive_window(VarInt::from_u32(RECEIVE_WINDOW))
+        .receive_window(VarInt::from_u32(RECEIVE_WINDOW))
         .max_concurrent_bidi_streams(VarInt::from_u32(1))
         .max_concurrent_uni_streams(VarInt::from_u32(0))
         .ack_frequency_config(Some(acks))
@@ -189,7 +198,9 @@ pub fn server(
     let mut config = ServerConfig::with_crypto(Arc::new(crypto));
     config
         .transport_config(Arc::new(transport()))
-        .max_incoming(16);
+        .max_incoming(16)
+        .incoming_buffer_size(INCOMING_BUFFER)
+        .incoming_buffer_size_total(16 * INCOMING_BUFFER);
     endpoint(identity, Some(config), socket, meter)
 }
 

@@ -100,12 +100,6 @@ pub enum HelloError {
     Text,
 }
 
-/// The version to speak: the lower of the two maxima, if both ends know it.
-pub fn negotiate(hello: &Hello, own_min: u16, own_max: u16) -> Option<u16> {
-    let version = hello.max.min(own_max);
-    (version >= hello.min && version >= own_min).then_some(version)
-}
-
 impl Hello {
     /// The 17 bytes of this greeting.
     pub fn encode(&self) -> Vec<u8> {
@@ -307,18 +301,5 @@ mod tests {
             ),
             Err(HelloError::Range { min: 2, max: 1 })
         );
-    }
-
-    #[test]
-    fn the_lower_maximum_is_spoken_if_both_know_it() {
-        let hello = |min, max| Hello {
-            min,
-            max,
-            features: 0,
-        };
-        assert_eq!(negotiate(&hello(1, 3), 1, 2), Some(2));
-        assert_eq!(negotiate(&hello(1, 1), 1, 2), Some(1));
-        assert_eq!(negotiate(&hello(3, 4), 1, 2), None);
-        assert_eq!(negotiate(&hello(1, 1), 2, 3), None);
     }
 }

@@ -10,5 +10,8 @@ mod params;
 pub mod state;
 pub mod turn;
 pub mod v1;
+pub mod v2;
+pub mod version;
 
 pub use codec::DecodeError;
+pub use version::{Version, Versions};

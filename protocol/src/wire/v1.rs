@@ -15,6 +15,9 @@ use super::turn::{WirePose, WireRotation};
 /// The version this module speaks.
 pub const VERSION: u16 = 1;
 
+/// Whether this version is released: from then on its bytes never change, and a test holds `tests/vectors/wire_v1.json` to that.
+pub const RELEASED: bool = false;
+
 /// The ALPN identifier that goes with it; it freezes the framing.
 pub const ALPN: &[u8] = b"telemime/1";
 
@@ -290,13 +293,18 @@ pub enum OperatorDatagram {
         t2_us: i64,
         /// When this left.
         t3_us: i64,
-        /// What a disciplined clock at the operator says, if it has one.
-        external: Option<ExternalClock>,
     },
     /// Emergency stop, repeated until the robot reports [`RobotState::Stopped`].
     Stop {
         /// The session's epoch.
         epoch: u32,
+    },
+    /// What a disciplined clock at the operator says; with every [`OperatorDatagram::Pong`], if it has one.
+    Clock {
+        /// The session's epoch.
+        epoch: u32,
+        /// What it says.
+        clock: ExternalClock,
     },
 }
 
@@ -550,7 +558,7 @@ impl OperatorDatagram {
                 motion.params.check("motion.params")?;
                 motion.pose.check()
             }
-            Self::Go { .. } | Self::Pong { .. } | Self::Stop { .. } => Ok(()),
+            Self::Go { .. } | Self::Pong { .. } | Self::Stop { .. } | Self::Clock { .. } => Ok(()),
         }
     }
 }

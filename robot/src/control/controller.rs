@@ -3,13 +3,13 @@
 use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
-use telemime_sim::arm::{ArmModel, Joints, PlantError, check_start};
+use telemime_sim::arm::{ArmModel, DeadTime, DeadTimeError, Joints, PlantError, check_start};
 
 use super::ik::{DifferentialIk, quaternion};
 use super::turn::checked;
 use super::{
     CartesianLimits, ComputedTorque, FilterConfig, FilterError, FilterState, IkConfig,
-    LimitedFilter, TurnFilter, TurnLimits, TurnState, joint_accelerations,
+    JointReference, LimitedFilter, TurnFilter, TurnLimits, TurnState, joint_accelerations,
 };
 
 /// The filter's reference may lead the joints' reference by this much, m; beyond, the arm cannot follow and the filter waits for it.
@@ -33,6 +33,8 @@ pub struct ControlConfig {
     pub orientation_gain: f64,
     /// How fast idle joints return to the start posture, 1/s.
     pub posture_gain: f64,
+    /// The arm obeys its setpoints this much later, s, at most [`MAX_DEAD_TIME_S`](telemime_sim::arm::MAX_DEAD_TIME_S).
+    pub dead_time_s: f64,
     /// Tick, s.
     pub dt_s: f64,
 }
@@ -55,6 +57,7 @@ impl Default for ControlConfig {
             joint_bandwidth: 80.0,
             orientation_gain: 8.0,
             posture_gain: 1.0,
+            dead_time_s: 0.0,
             dt_s: 1e-3,
         }
     }
@@ -69,6 +72,9 @@ pub enum ControlError {
     /// The limits of turning are impossible.
     #[error("limits of the tip's rotation, in rad instead of m: {0}")]
     Turn(#[source] FilterError),
+    /// The arm's dead time is out of range.
+    #[error(transparent)]
+    DeadTime(#[from] DeadTimeError),
     /// A gain that is not a positive number.
     #[error("{what} is {value}; it must be a positive number, and small against 1/dt")]
     Gain {
@@ -102,7 +108,7 @@ pub enum ControlError {
 /// What the tip is to do.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Demand {
-    /// Be at `target`, and in `orientation` as far as the arm can be at once, 3/ω from now.
+    /// Be at `target`, and in `orientation` as far as the arm can be at once, 3/ω and the dead time from now.
     Follow {
         /// Tip position in the base frame, m.
         target: Vector3<f64>,
@@ -191,9 +197,9 @@ pub struct Output {
     pub tip: Vector3<f64>,
     /// How they orient it: tip axes to base axes.
     pub orientation: UnitQuaternion<f64>,
-    /// The angle from there to the orientation demanded, or to the one being kept, rad: of a demand that turns, what is due only 3/ω later is part of it.
+    /// The angle from there to the orientation demanded, or to the one being kept, rad: of a demand that turns, what is due only [`Controller::lag_s`] later is part of it.
     pub orientation_error_rad: f64,
-    /// The joints' reference at this tick, rad or m.
+    /// The setpoint that the joints' drives follow at this tick, rad or m: the reference of the dead time ago.
     pub q_ref: Joints,
     /// What was clamped.
     pub clamps: Clamps,
@@ -210,6 +216,7 @@ pub struct Controller {
     /// An orientation has been demanded since the last reset.
     turns: bool,
     ik: DifferentialIk,
+    setpoints: DeadTime<JointReference>,
     torque: ComputedTorque,
     counts: ClampCounts,
 }
@@ -265,6 +272,7 @@ impl Controller {
             ..filter_config
         };
         let turn = TurnFilter::new(turn_config, ik.orientation()).map_err(ControlError::Turn)?;
+        let setpoints = DeadTime::new(config.dead_time_s, config.dt_s, *ik.reference())?;
         Ok(Self {
             arm,
             limits,
@@ -273,6 +281,7 @@ impl Controller {
             turn,
             turns: false,
             ik,
+            setpoints,
             torque: ComputedTorque::new(config.joint_bandwidth),
             counts: ClampCounts::default(),
         })
@@ -288,9 +297,15 @@ impl Controller {
         &self.turn_limits
     }
 
-    /// The time by which the tip lags its demand in position and orientation, 3/ω, s.
+    /// The time by which the tip lags its demand in position and orientation, s: 3/ω and the arm's dead time.
     pub fn lag_s(&self) -> f64 {
-        3.0 / self.filter.config().omega
+        3.0 / self.filter.config().omega + self.setpoints.seconds()
+    }
+
+    /// The largest joint speed among the setpoints that the arm has not obeyed yet, rad/s or m/s.
+    pub fn fastest_on_its_way(&self) -> f64 {
+        let waiting = self.setpoints.on_its_way().iter();
+        waiting.map(|r| r.qd.amax()).fold(0.0, f64::max)
     }
 
     /// What has been clamped since the controller was made.
@@ -320,6 +335,7 @@ impl Controller {
         self.filter.reset(tip);
         self.turn.reset(self.ik.orientation());
         self.turns = false;
+        self.setpoints.fill(*self.ik.reference());
         tip
     }
 
@@ -353,6 +369,7 @@ impl Controller {
 
         let (reference, mut joints) = now;
         joints.qdd = self.ik.reference().qdd;
+        let joints = self.setpoints.pass(joints);
         let measured = q.iter().chain(qd.iter()).all(|x| x.is_finite());
         clamps.invalid |= !measured;
         let (q, qd) = if measured {

@@ -39,7 +39,7 @@ pub struct CoreConfig {
     pub safety: SafetyConfig,
     /// Period, s.
     pub tick_s: f64,
-    /// From predicted target to tip, s: the filter's 3/ω, since the simulated arm has no dead time.
+    /// From predicted target to tip, s: the filter's 3/ω and the arm's dead time.
     pub lag_s: f64,
     /// Where the tip may be.
     pub workspace: Workspace,
@@ -86,6 +86,8 @@ pub struct Core {
     opening: f64,
     target_m: Vector3<f64>,
     reference_m: Vector3<f64>,
+    acceleration: Vector3<f64>,
+    jerk_m_s3: f64,
     moving: bool,
 }
 
@@ -130,6 +132,8 @@ impl Core {
             turned_to: None,
             target_m: tip_m,
             reference_m: tip_m,
+            acceleration: Vector3::zeros(),
+            jerk_m_s3: 0.0,
             moving: false,
         }
     }
@@ -168,9 +172,12 @@ impl Core {
         self.orientation_error_rad = output.orientation_error_rad;
         self.tip_m = output.tip;
         self.reference_m = output.reference.p;
+        self.jerk_m_s3 = (output.reference.a - self.acceleration).norm() / self.config.tick_s;
+        self.acceleration = output.reference.a;
         self.moving = output.reference.v.norm() > STILL_M_S
             || output.turn.angular_velocity.norm() > STILL_TURN_RAD_S
-            || self.plant.qd().amax() > STILL_RAD_S;
+            || self.plant.qd().amax() > STILL_RAD_S
+            || self.controller.fastest_on_its_way() > STILL_RAD_S;
         self.tick += 1;
         let report = self.report(now);
         // A full ring means a stalled session; the servo does not wait for it.
@@ -371,6 +378,7 @@ impl Core {
             age_s,
             target_m: self.target_m,
             reference_m: self.reference_m,
+            jerk_m_s3: self.jerk_m_s3,
             tip_m: self.tip_m,
             orientation: self.orientation,
             orientation_error_rad: self.orientation_error_rad,

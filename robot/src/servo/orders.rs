@@ -144,6 +144,8 @@ pub struct Report {
     pub target_m: Vector3<f64>,
     /// Where the filter has it, m.
     pub reference_m: Vector3<f64>,
+    /// How fast the filter's acceleration changes, m/s³.
+    pub jerk_m_s3: f64,
     /// Tip, m.
     pub tip_m: Vector3<f64>,
     /// How it is oriented: tip axes to base axes.

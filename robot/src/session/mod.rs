@@ -15,7 +15,6 @@ use telemime_endpoint::Mono;
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
-use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::turn::{WireRotation, dequantise_grip, quantise_grip};
@@ -23,6 +22,7 @@ use telemime_protocol::wire::v1::{
     Cause, Drive, Engage, ExternalClock, Info, MAX_PLAN_LEN, Message, ModelId, OperatorControl,
     OperatorDatagram, Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
 };
+use telemime_protocol::wire::{DecodeError, Version, Versions};
 
 use crate::clock::{SessionClock, Slew};
 use crate::servo::{Engagement, Lease, Order, Report, Source, Ticket, Trajectory};
@@ -40,6 +40,8 @@ pub struct SessionConfig {
     pub telemetry_s: f64,
     /// A sample that took longer than this to arrive authorises nothing beyond, s.
     pub max_delay_s: f64,
+    /// The protocol versions this robot speaks.
+    pub versions: Versions,
 }
 
 impl Default for SessionConfig {
@@ -47,6 +49,7 @@ impl Default for SessionConfig {
         Self {
             telemetry_s: 0.05,
             max_delay_s: 0.5,
+            versions: Versions::default(),
         }
     }
 }
@@ -96,9 +99,12 @@ pub struct Session {
     config: SessionConfig,
     info: Info,
     epoch: u32,
+    version: Version,
     clock: SessionClock,
     external: Option<ExternalClock>,
     skill: Option<Arc<Skill>>,
+    /// Takes its place at the next engage.
+    next_skill: Option<Arc<Skill>>,
     plan: Option<(u32, PosePlan)>,
     mirror: Option<Mirror>,
     engagement: u32,
@@ -129,9 +135,11 @@ impl Session {
         let mut session = Self {
             config,
             epoch,
+            version: Version::V1,
             clock: SessionClock::default(),
             external: None,
             skill,
+            next_skill: None,
             plan: None,
             mirror: None,
             engagement: 0,
@@ -154,9 +162,16 @@ impl Session {
         session
     }
 
+    /// Speaks `version` instead of version 1.
+    #[must_use]
+    pub fn speaking(mut self, version: Version) -> Self {
+        self.version = version;
+        self
+    }
+
     /// The model held, for the next session.
     pub fn skill(&self) -> Option<Arc<Skill>> {
-        self.skill.clone()
+        self.next_skill.as_ref().or(self.skill.as_ref()).cloned()
     }
 
     /// What the robot's own disciplined clock says now, relative to its monotonic one, if it has one.
@@ -226,7 +241,7 @@ impl Session {
 
     /// A datagram. Nothing in it can end the session: what is wrong is dropped and counted.
     pub fn handle_datagram(&mut self, now: Mono, bytes: &[u8]) {
-        let taken = match OperatorDatagram::decode(bytes) {
+        let taken = match self.version.decode_operator_datagram(bytes) {
             Ok(OperatorDatagram::Motion(motion)) => self.on_motion(now, &motion),
             Ok(OperatorDatagram::Go {
                 epoch,
@@ -240,7 +255,6 @@ impl Session {
                 t1_us,
                 t2_us,
                 t3_us,
-                external,
             }) if epoch == self.epoch => {
                 let stamp = |us: i64| Stamp(us.saturating_mul(1000));
                 self.clock.observe(
@@ -249,20 +263,32 @@ impl Session {
                     stamp(t3_us),
                     now,
                 );
-                if let (Some(theirs), Some(ours)) = (external, self.external) {
+                self.follow_clock(now);
+                true
+            }
+            Ok(OperatorDatagram::Clock {
+                epoch,
+                clock: theirs,
+            }) if epoch == self.epoch => {
+                if let Some(ours) = self.external {
                     let ahead_us = ours.ahead_us.saturating_sub(theirs.ahead_us);
                     let bound_us = f64::from(ours.dispersion_us) + f64::from(theirs.dispersion_us);
                     let offset_ns = ahead_us.saturating_mul(1000);
                     self.clock.observe_outside(now, offset_ns, bound_us * 1e-6);
+                    self.follow_clock(now);
                 }
-                self.follow_clock(now);
                 true
             }
             Ok(OperatorDatagram::Stop { epoch }) if epoch == self.epoch => {
                 self.brake(Cause::OperatorStop);
                 true
             }
-            Ok(OperatorDatagram::Pong { .. } | OperatorDatagram::Stop { .. }) | Err(_) => false,
+            Ok(
+                OperatorDatagram::Pong { .. }
+                | OperatorDatagram::Stop { .. }
+                | OperatorDatagram::Clock { .. },
+            )
+            | Err(_) => false,
         };
         if !taken {
             self.counters.dropped += 1;
@@ -353,11 +379,24 @@ impl Session {
     fn store_model(&mut self, id: ModelId, bytes: &[u8]) {
         match Skill::from_bytes(bytes) {
             Ok(skill) if skill.id().0 == id => {
-                self.skill = Some(Arc::new(skill));
+                // What is being followed goes on with the model it began with: another one would be a jump.
+                let skill = Some(Arc::new(skill));
+                if self.is_following() {
+                    self.next_skill = skill;
+                } else {
+                    (self.skill, self.next_skill) = (skill, None);
+                }
                 self.send(&RobotControl::ModelStored { id });
             }
             _ => self.refuse(Refusal::BadModel),
         }
+    }
+
+    /// Something is followed, or was granted a moment ago.
+    fn is_following(&self) -> bool {
+        let state = self.report.map(|r| r.state);
+        self.acknowledged != self.engagement
+            || matches!(state, Some(RobotState::Engaged | RobotState::Coasting))
     }
 
     fn engage(&mut self, now: Mono, engage: &Engage) -> Result<(), Refusal> {
@@ -376,6 +415,9 @@ impl Session {
         // What was granted a moment ago is not in a report yet.
         if self.acknowledged != self.engagement {
             return Err(Refusal::AlreadyEngaged);
+        }
+        if let Some(next) = self.next_skill.take() {
+            self.skill = Some(next);
         }
         let [w, x, y, z] = engage.rotation.map(f64::from);
         let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));

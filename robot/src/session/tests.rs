@@ -75,6 +75,7 @@ fn report(state: RobotState) -> Report {
         age_s: 0.0,
         target_m: tip_m,
         reference_m: tip_m,
+        jerk_m_s3: 0.0,
         tip_m,
         orientation: UnitQuaternion::identity(),
         orientation_error_rad: 0.0,
@@ -138,7 +139,6 @@ impl Bench {
             t1_us: t1 / 1000,
             t2_us: at / 1000,
             t3_us: at / 1000,
-            external: None,
         });
     }
 

@@ -4,6 +4,7 @@
 //! owns ([`Kinematics`], [`Dynamics`]): nothing allocates after [`ArmModel::from_urdf`].
 //! The base frame is the URDF's root link; gravity is [`GRAVITY`] in it.
 
+mod dead_time;
 mod dynamics;
 mod error;
 mod gripper;
@@ -19,6 +20,7 @@ mod tests;
 
 use nalgebra::{SMatrix, SVector, Vector3};
 
+pub use dead_time::{DeadTime, DeadTimeError, MAX_DEAD_TIME_S};
 pub use dynamics::Dynamics;
 pub use error::{ArmError, Notice};
 pub use gripper::{Gripper, GripperError};

@@ -4,6 +4,8 @@
 //! differ in width, time and course), so that what is learned and predicted from it behaves as on those.
 
 mod reach;
+mod tap;
+mod tracker;
 
 use core::f64::consts::PI;
 
@@ -12,6 +14,8 @@ use rand_distr::{Distribution, StandardNormal};
 use rand_xoshiro::Xoshiro256PlusPlus;
 
 pub use reach::reach;
+pub use tap::taps;
+pub use tracker::glitched;
 
 /// Sensor frame period, s.
 const FRAME_S: f64 = 1.0 / 30.0;
@@ -109,7 +113,7 @@ fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
 }
 
 /// A time, s, and a place, m.
-type Frame = (f64, [f64; 3]);
+pub type Frame = (f64, [f64; 3]);
 
 /// A performance as the sensor sees it, and in every frame the true way from elbow to hand, aside and up, in forearms.
 fn frames(seed: u64, index: u32) -> (Vec<Frame>, Vec<[f64; 2]>) {

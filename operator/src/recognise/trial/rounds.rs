@@ -1,7 +1,7 @@
 //! What is learned from and what is held out, round by round.
 
 use super::TrialError;
-use crate::demonstration::{Demonstration, Demonstrations};
+use crate::demonstration::{Demonstration, Demonstrations, PersonPattern};
 
 /// What is held out of learning.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -30,17 +30,11 @@ pub(super) struct Round {
     pub(super) test: Chosen,
 }
 
-/// The person who performs, as names like `a3_s1_t2` (gesture, person, trial) have it; empty if the name has
-/// no such parts.
-pub fn person(demonstration: &Demonstration) -> &str {
-    let mut parts = demonstration.name().rsplit('_');
-    match (parts.next(), parts.next(), parts.next()) {
-        (Some(_), Some(person), Some(_)) => person,
-        _ => "",
-    }
-}
-
-pub(super) fn rounds(sets: &[Demonstrations], split: Split) -> Result<Vec<Round>, TrialError> {
+pub(super) fn rounds(
+    sets: &[Demonstrations],
+    split: Split,
+    persons: &PersonPattern,
+) -> Result<Vec<Round>, TrialError> {
     if sets.len() < 2 {
         return Err(TrialError::Skills { found: sets.len() });
     }
@@ -53,8 +47,8 @@ pub(super) fn rounds(sets: &[Demonstrations], split: Split) -> Result<Vec<Round>
     }
     match split {
         Split::Demonstrations { folds } => Ok(by_demonstration(sets, folds)),
-        Split::Persons => by_person(sets),
-        Split::Own => each_ones_own(sets),
+        Split::Persons => by_person(sets, persons),
+        Split::Own => each_ones_own(sets, persons),
     }
 }
 
@@ -66,19 +60,20 @@ fn by_demonstration(sets: &[Demonstrations], folds: usize) -> Vec<Round> {
         .collect()
 }
 
-fn by_person(sets: &[Demonstrations]) -> Result<Vec<Round>, TrialError> {
+fn by_person(sets: &[Demonstrations], names: &PersonPattern) -> Result<Vec<Round>, TrialError> {
     for set in sets {
-        let first = person(&set.demonstrations[0]);
-        if set.demonstrations.iter().all(|d| person(d) == first) {
+        let first = names.person(&set.demonstrations[0]);
+        if set.demonstrations.iter().all(|d| names.person(d) == first) {
             return Err(TrialError::Persons {
                 name: set.name.clone(),
                 person: first.to_owned(),
+                pattern: names.to_string(),
             });
         }
     }
-    let rounds = persons(sets)
+    let rounds = everybody(sets, names)
         .into_iter()
-        .map(|who| divide(sets, |d, _| person(d) == who));
+        .map(|who| divide(sets, |d, _| names.person(d) == who));
     Ok(rounds.collect())
 }
 
@@ -94,14 +89,14 @@ fn divide(sets: &[Demonstrations], held: impl Fn(&Demonstration, usize) -> bool)
     Round { train, test }
 }
 
-fn each_ones_own(sets: &[Demonstrations]) -> Result<Vec<Round>, TrialError> {
+fn each_ones_own(sets: &[Demonstrations], names: &PersonPattern) -> Result<Vec<Round>, TrialError> {
     let mut rounds = Vec::new();
-    for who in persons(sets) {
+    for who in everybody(sets, names) {
         let own: Chosen = sets
             .iter()
             .enumerate()
             .map(|(skill, set)| {
-                let by = |i: &usize| person(&set.demonstrations[*i]) == who;
+                let by = |i: &usize| names.person(&set.demonstrations[*i]) == who;
                 (skill, (0..set.demonstrations.len()).filter(by).collect())
             })
             .filter(|(_, of): &(usize, Vec<usize>)| of.len() > 1)
@@ -125,15 +120,18 @@ fn each_ones_own(sets: &[Demonstrations]) -> Result<Vec<Round>, TrialError> {
         }
     }
     if rounds.is_empty() {
-        return Err(TrialError::NobodysOwn);
+        return Err(TrialError::NobodysOwn {
+            pattern: names.to_string(),
+        });
     }
     Ok(rounds)
 }
 
 /// Everybody, in order of first appearance.
-fn persons(sets: &[Demonstrations]) -> Vec<&str> {
+fn everybody<'a>(sets: &'a [Demonstrations], names: &PersonPattern) -> Vec<&'a str> {
     let mut all: Vec<&str> = Vec::new();
-    for who in sets.iter().flat_map(|s| &s.demonstrations).map(person) {
+    for d in sets.iter().flat_map(|s| &s.demonstrations) {
+        let who = names.person(d);
         if !all.contains(&who) {
             all.push(who);
         }
@@ -175,7 +173,7 @@ mod tests {
         let sets = two();
         for split in [Split::Demonstrations { folds: 4 }, Split::Persons] {
             let mut tried = Vec::new();
-            for round in rounds(&sets, split).unwrap() {
+            for round in rounds(&sets, split, &PersonPattern::default()).unwrap() {
                 for ((skill, train), (_, test)) in round.train.iter().zip(&round.test) {
                     assert!(!train.is_empty(), "{split:?}");
                     assert!(test.iter().all(|i| !train.contains(i)), "{split:?}");
@@ -190,7 +188,7 @@ mod tests {
 
     #[test]
     fn an_operator_is_learned_from_alone() {
-        let own = rounds(&two(), Split::Own).unwrap();
+        let own = rounds(&two(), Split::Own, &PersonPattern::default()).unwrap();
         // s2 and s3 perform one skill each.
         assert_eq!(own.len(), 2);
         assert_eq!(own[0].train, [(0, vec![1]), (1, vec![1])]);
@@ -200,7 +198,9 @@ mod tests {
     #[test]
     fn what_cannot_be_split_is_refused() {
         let [a, b] = two();
-        let refused = |sets: &[Demonstrations], split| rounds(sets, split).unwrap_err();
+        let refused = |sets: &[Demonstrations], split| {
+            rounds(sets, split, &PersonPattern::default()).unwrap_err()
+        };
         let folds = Split::Demonstrations { folds: 4 };
         assert!(matches!(
             refused(std::slice::from_ref(&a), folds),
@@ -218,7 +218,7 @@ mod tests {
         ));
         assert!(matches!(
             refused(&[a, alone], Split::Own),
-            TrialError::NobodysOwn
+            TrialError::NobodysOwn { .. }
         ));
     }
 }

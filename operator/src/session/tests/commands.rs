@@ -84,7 +84,12 @@ fn every_refusal_but_a_divergence_ends_the_attempt() {
 
 #[test]
 fn what_a_declined_request_took_is_not_counted() {
-    let mut bench = Bench::ready(SessionConfig::default(), None);
+    // A hand that is in two places at once.
+    let config = SessionConfig {
+        glitch_gate: false,
+        ..SessionConfig::default()
+    };
+    let mut bench = Bench::ready(config, None);
     bench.sample(home());
     for reason in [Refusal::ClockUnknown, Refusal::Moving] {
         bench.session.engage(bench.now);
@@ -267,7 +272,6 @@ fn pings_are_answered_and_foreign_datagrams_counted() {
         t1_us: -5,
         t2_us: t_us,
         t3_us: t_us,
-        external: None,
     };
     assert_eq!(bench.datagrams, [pong]);
     bench.forget();

@@ -23,6 +23,7 @@ fn a_request_carries_the_hand_and_the_mapping() {
         rotation: UnitQuaternion::from_euler_angles(0.1, 0.2, 0.3),
         path_bound_m: Some(0.0123),
         scale: Some(0.2),
+        glitch_gate: false,
         ..SessionConfig::default()
     };
     let skill = example(2, 24);
@@ -334,7 +335,7 @@ fn what_is_not_acknowledged_is_sent_again() {
 }
 
 /// What the robot makes of the path tails among `control`.
-fn by_stream(control: &[OperatorControl], bound_m: f64) -> PathDecoder {
+pub(super) fn by_stream(control: &[OperatorControl], bound_m: f64) -> PathDecoder {
     let code = code(bound_m);
     let mut path = PathDecoder::new(code.grid, 4096);
     let mut frontier = 0;
@@ -364,6 +365,7 @@ fn a_path_that_no_datagram_delivers_goes_by_the_stream_to_its_last_sample() {
     const BOUND_M: f64 = 0.002;
     let config = SessionConfig {
         path_bound_m: Some(BOUND_M),
+        glitch_gate: false,
         ..bound(0.05)
     };
     let mut bench = Bench::engaged(config, None);

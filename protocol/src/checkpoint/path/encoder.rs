@@ -53,7 +53,7 @@ impl<const D: usize> PathEncoder<D> {
     fn on(grid: PathGrid<D>, second: usize, bounds: [f64; 2]) -> Self {
         Self {
             grid,
-            reach: Reach::new(Bounds::new(second, bounds)),
+            reach: Reach::new(Bounds::new(second, bounds), MAX_OPEN),
             from: None,
             open: Vec::with_capacity(MAX_OPEN),
             since: Stamp::ZERO,

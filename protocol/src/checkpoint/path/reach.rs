@@ -63,36 +63,38 @@ impl<const D: usize> Cubic<D> {
     }
 }
 
-/// What is known of the span that grows from one knot.
-///
-/// From sample to sample the span changes little. Of the last cubic that was compared with every sample it is
-/// known by how much it stays inside the bound; while a new one differs from it by less, older samples need no look.
+/// So many samples share one memory of how far they were off.
+const BLOCK: usize = 16;
+
+/// The largest error of a block of samples under some cubic, in bounds: fewer than one.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Reach<const D: usize> {
-    bounds: Bounds<D>,
-    proven: Option<Proven<D>>,
+struct Known<const D: usize> {
+    cubic: Cubic<D>,
+    worst: f64,
 }
 
-#[derive(Clone, Copy, Debug)]
-struct Proven<const D: usize> {
-    cubic: Cubic<D>,
-    samples: usize,
-    until_s: f64,
-    /// In bounds.
-    margin: f64,
+/// What is known of the span that grows from one knot.
+///
+/// From sample to sample the span changes little. Of every block of samples it is known how far one cubic was off;
+/// where a new one differs from that by less than was left, these samples need no look.
+#[derive(Clone, Debug)]
+pub(super) struct Reach<const D: usize> {
+    bounds: Bounds<D>,
+    known: Vec<Option<Known<D>>>,
 }
 
 impl<const D: usize> Reach<D> {
-    pub(super) fn new(bounds: Bounds<D>) -> Self {
+    /// For spans of at most so many samples.
+    pub(super) fn new(bounds: Bounds<D>, most: usize) -> Self {
         Self {
             bounds,
-            proven: None,
+            known: Vec::with_capacity(most / BLOCK + 1),
         }
     }
 
     /// The span grows from another knot.
     pub(super) fn restart(&mut self) {
-        self.proven = None;
+        self.known.clear();
     }
 
     /// Whether the span between two knots passes `samples`, all that lie between them, within the bounds.
@@ -107,42 +109,48 @@ impl<const D: usize> Reach<D> {
             return false;
         };
         let cubic = Cubic::between(from, to, &self.bounds);
-        let known = match &self.proven {
-            Some(p) if p.samples <= samples.len() && self.differ(p, &cubic) <= p.margin => {
-                p.samples
-            }
-            _ => 0,
-        };
-        let mut worst = 0.0f64;
+        let (blocks, rest) = samples.as_chunks::<BLOCK>();
+        if self.worst(&span, rest).is_none() {
+            return false;
+        }
+        if self.known.len() < blocks.len() {
+            self.known.resize(blocks.len(), None);
+        }
         // The newest first: they are the ones a stretched span misses.
-        for s in samples[known..].iter().rev() {
-            let Some(x) = span.position(s.t_s) else {
+        for (i, block) in blocks.iter().enumerate().rev() {
+            let within = [block[0].t_s, block[BLOCK - 1].t_s];
+            let still = |known: &Known<D>| {
+                known.worst + self.differ(&known.cubic, &cubic, within) <= 1.0 - SLACK
+            };
+            if self.known[i].as_ref().is_some_and(still) {
+                continue;
+            }
+            let Some(worst) = self.worst(&span, block) else {
                 return false;
             };
-            worst = worst.max(self.bounds.squared(&(x - s.x)));
-            if !(worst <= 1.0 - 1e-12) {
-                return false;
-            }
-        }
-        if known == 0 {
-            self.proven = samples.last().map(|last| Proven {
-                cubic,
-                samples: samples.len(),
-                until_s: last.t_s,
-                margin: 1.0 - SLACK - worst.sqrt() - cubic.rounding,
-            });
+            self.known[i] = Some(Known { cubic, worst });
         }
         true
     }
 
-    /// No less than the largest distance of two cubics from one knot, in bounds, over the proven time: what they
+    /// The largest error at `samples`, in bounds; `None` if one is beyond them.
+    fn worst(&self, span: &HermiteSpan<D>, samples: &[Sample<D>]) -> Option<f64> {
+        let mut worst = 0.0f64;
+        for s in samples.iter().rev() {
+            worst = worst.max(self.bounds.squared(&(span.position(s.t_s)? - s.x)));
+            if !(worst <= 1.0 - 1e-12) {
+                return None;
+            }
+        }
+        Some(worst.sqrt())
+    }
+
+    /// No less than the largest distance of two cubics from one knot, in bounds, between two times: what they
     /// differ by is t²·(Δb + Δc·t), and a line is longest at an end.
-    fn differ(&self, p: &Proven<D>, cubic: &Cubic<D>) -> f64 {
-        let (b, c) = (cubic.b - p.cubic.b, cubic.c - p.cubic.c);
-        let at = |t_s: f64| self.bounds.squared(&(b + c * t_s)).sqrt();
-        let (h, half) = (p.until_s, 0.5 * p.until_s);
-        let middle = at(half);
-        let most = (at(0.0).max(middle) * half * half).max(middle.max(at(h)) * h * h);
-        most * (1.0 + SLACK) + cubic.rounding
+    fn differ(&self, a: &Cubic<D>, b: &Cubic<D>, [start_s, end_s]: [f64; 2]) -> f64 {
+        let (square, cube) = (b.b - a.b, b.c - a.c);
+        let at = |t_s: f64| self.bounds.squared(&(square + cube * t_s));
+        let most = at(start_s).max(at(end_s)).sqrt() * end_s * end_s;
+        most * (1.0 + SLACK) + a.rounding + b.rounding
     }
 }

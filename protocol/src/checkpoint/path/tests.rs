@@ -472,6 +472,35 @@ mod pose {
         }
     }
 
+    /// What the live path costs is known beforehand, also where it runs beside a control loop.
+    #[test]
+    fn once_made_neither_end_allocates() {
+        let mut encoder = PathEncoder::with_bounds(3, BOUNDS).unwrap();
+        let mut decoder = PathDecoder::new(encoder.grid(), 8);
+        let samples: Vec<_> = (0..3000_i64)
+            .map(|i| {
+                let s = i as f64 * 1e-3;
+                let q = exp(&(Vector3::new(1.0, 0.2, 0.0) * s));
+                let x = Vector3::new(libm::sin(9.0 * s), libm::cos(7.0 * s), s) * 0.3;
+                (Stamp(i * 1_000_000), pose(&x, &q.coords))
+            })
+            .collect();
+        let mut knots = 0;
+        let touched = allocation_counter::measure(|| {
+            for (t, x) in &samples {
+                if let Some(knot) = encoder.push(*t, *x).unwrap() {
+                    decoder.append(&knot).unwrap();
+                    knots += 1;
+                }
+                if let Some(frontier) = decoder.frontier() {
+                    assert!(decoder.eval(frontier).is_some());
+                }
+            }
+        });
+        assert!(knots > 8, "{knots}: the decoder has forgotten some");
+        assert_eq!(touched.count_total, 0);
+    }
+
     /// Steps of every kind in every coordinate, at intervals of every kind.
     fn wild() -> impl Strategy<Value = Vec<(Stamp, Pose)>> {
         let interval = prop_oneof![

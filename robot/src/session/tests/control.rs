@@ -246,6 +246,37 @@ fn a_model_is_kept_if_its_hash_is_right() {
 }
 
 #[test]
+fn a_model_that_comes_while_the_arm_follows_is_used_from_the_next_engage_on() {
+    let (old, new) = (example(2, 24), example(3, 24));
+    let mut bench = Bench::mirroring(Some(old.clone()));
+    let (id, bytes) = (new.id().0, new.to_bytes().to_vec());
+    bench.control(&OperatorControl::Model { id, bytes });
+    assert_eq!(bench.control, [RobotControl::ModelStored { id }]);
+    assert_eq!(
+        bench.session.skill().as_deref(),
+        Some(&new),
+        "the next session begins with it"
+    );
+    let predicts = |session: &Session, skill: &Skill| {
+        let state = HandState::first(Stamp::ZERO, Vector3::new(0.1, 0.2, 2.5));
+        let tag = telemime_protocol::wire::v1::model_tag(&skill.id().0);
+        session.forecast(&state, tag, &STEADY) == skill.predictor().forecast(&state, &STEADY)
+    };
+    assert!(predicts(&bench.session, &old) && !predicts(&bench.session, &new));
+    bench.control(&OperatorControl::Release { engagement: 1 });
+    bench.reports(RobotState::Ready);
+    let engage = bench.mirror(2);
+    bench.engage(&engage);
+    assert!(predicts(&bench.session, &new) && !predicts(&bench.session, &old));
+    // At rest there is nothing to wait for.
+    bench.control(&OperatorControl::Release { engagement: 2 });
+    bench.reports(RobotState::Ready);
+    let (id, bytes) = (old.id().0, old.to_bytes().to_vec());
+    bench.control(&OperatorControl::Model { id, bytes });
+    assert!(predicts(&bench.session, &old) && !predicts(&bench.session, &new));
+}
+
+#[test]
 fn a_plan_is_played_from_its_beginning() {
     let mut bench = Bench::ready(None);
     let request = play(&bench, 1, 7);

@@ -68,7 +68,6 @@ fn what_is_foreign_malformed_or_impossible_is_dropped_and_counted() {
             t1_us: 0,
             t2_us: 0,
             t3_us: 0,
-            external: None,
         }
         .encode(),
         vec![],

@@ -1,0 +1,184 @@
+//! What is learned while driving: performances that were kept, and the skill refined by them.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use telemime_protocol::skill::Skill;
+use tokio::task::JoinHandle;
+
+use crate::demonstration::{Demonstration, DemonstrationError, Sample};
+use crate::learn::{LearnError, Refinement, refine};
+use crate::session::HandSample;
+use crate::skill_file::{self, SkillFileError};
+
+/// Why nothing was learned.
+#[derive(Debug, thiserror::Error)]
+pub enum LessonError {
+    /// Without a skill.
+    #[error("there is no skill to refine: start with --learn DIR or --skill FILE")]
+    NoSkill,
+    /// Without an engagement.
+    #[error("nothing was driven yet: keep takes the engagement that ended last")]
+    NothingDriven,
+    /// The same engagement.
+    #[error("this engagement is kept already")]
+    KeptAlready,
+    /// Without a performance.
+    #[error("no performance is kept: say keep after one that is to be learned from")]
+    NothingKept,
+    /// While refining.
+    #[error("the skill is being refined: say it again in a moment")]
+    Busy,
+    /// The performance is no demonstration.
+    #[error("the engagement is no demonstration: {0}")]
+    Demonstration(#[from] DemonstrationError),
+    /// It cannot be learned.
+    #[error("not learned: {0}")]
+    Learn(#[from] LearnError),
+    /// The skill cannot be written.
+    #[error(transparent)]
+    Save(#[from] SkillFileError),
+    /// The thread died.
+    #[error("refining ended early; the skill is as it was")]
+    Died,
+}
+
+/// What refining came to.
+#[derive(Debug)]
+pub struct Lesson {
+    /// The skill as it is now; `None` if nothing could be learned.
+    pub skill: Option<Arc<Skill>>,
+    /// What each performance was to it.
+    pub learned: Vec<Refinement>,
+    /// Those left out, with the reason.
+    pub left_out: Vec<(String, String)>,
+}
+
+/// Performances kept in this run, and the skill that learns from them, on a thread of its own.
+#[derive(Debug, Default)]
+pub struct Lessons {
+    skill: Option<Arc<Skill>>,
+    kept: Vec<Demonstration>,
+    hashes: Vec<[u8; 32]>,
+    work: Option<JoinHandle<Lesson>>,
+}
+
+impl Lessons {
+    /// Begins with `skill`.
+    pub fn new(skill: Option<Arc<Skill>>) -> Self {
+        Self {
+            skill,
+            ..Self::default()
+        }
+    }
+
+    /// The skill, refined by all that was learned so far.
+    pub fn skill(&self) -> Option<Arc<Skill>> {
+        self.skill.clone()
+    }
+
+    /// Takes what was driven as a demonstration; returns its name.
+    ///
+    /// # Errors
+    /// [`LessonError`]: nothing was driven, it is kept already, or it is no demonstration.
+    pub fn keep(&mut self, driven: &[HandSample]) -> Result<String, LessonError> {
+        let skill = self.skill.as_ref().ok_or(LessonError::NoSkill)?;
+        let first = driven.first().ok_or(LessonError::NothingDriven)?;
+        let samples: Vec<_> = driven
+            .iter()
+            .map(|sample| Sample {
+                t_s: sample.t.secs_since(first.t),
+                position: sample.x,
+                orientation: sample.orientation,
+                grip: sample.grip,
+            })
+            .collect();
+        let name = format!("{} driven {}", skill.name(), self.hashes.len() + 1);
+        let demonstration = Demonstration::from_samples(&name, &samples)?;
+        if self.hashes.contains(demonstration.sha256()) {
+            return Err(LessonError::KeptAlready);
+        }
+        self.hashes.push(*demonstration.sha256());
+        self.kept.push(demonstration);
+        Ok(name)
+    }
+
+    /// Begins to refine the skill with what was kept.
+    ///
+    /// # Errors
+    /// [`LessonError`]: there is no skill, nothing was kept, or it is being refined already.
+    pub fn refine(&mut self) -> Result<(), LessonError> {
+        let skill = self.skill.clone().ok_or(LessonError::NoSkill)?;
+        if self.is_busy() {
+            return Err(LessonError::Busy);
+        }
+        if self.kept.is_empty() {
+            return Err(LessonError::NothingKept);
+        }
+        let kept = std::mem::take(&mut self.kept);
+        self.work = Some(tokio::task::spawn_blocking(move || {
+            learn_from(&skill, &kept)
+        }));
+        Ok(())
+    }
+
+    /// Whether the skill is being refined.
+    pub fn is_busy(&self) -> bool {
+        self.work.is_some()
+    }
+
+    /// Waits until the skill is refined; for ever if it is not being refined. May be dropped and called again.
+    ///
+    /// # Errors
+    /// [`LessonError::Died`].
+    pub async fn finished(&mut self) -> Result<Lesson, LessonError> {
+        let Some(work) = &mut self.work else {
+            return std::future::pending().await;
+        };
+        let done = work.await;
+        self.work = None;
+        let lesson = done.map_err(|_| LessonError::Died)?;
+        if let Some(skill) = &lesson.skill {
+            self.skill = Some(Arc::clone(skill));
+        }
+        Ok(lesson)
+    }
+
+    /// Writes the skill to a file.
+    ///
+    /// # Errors
+    /// [`LessonError`]: there is none, it is being refined, or the file cannot be written.
+    pub fn save(&self, path: &Path) -> Result<(), LessonError> {
+        let skill = self.skill.as_ref().ok_or(LessonError::NoSkill)?;
+        if self.is_busy() {
+            return Err(LessonError::Busy);
+        }
+        Ok(skill_file::save(skill, path)?)
+    }
+
+    /// Where [`Lessons::save`] puts the skill within a folder.
+    pub fn file_in(&self, folder: &Path) -> Option<PathBuf> {
+        let skill = self.skill.as_ref()?;
+        Some(folder.join(format!("{}.skill", skill.name())))
+    }
+}
+
+fn learn_from(skill: &Arc<Skill>, kept: &[Demonstration]) -> Lesson {
+    let mut newest: Option<Skill> = None;
+    let (mut learned, mut left_out) = (Vec::new(), Vec::new());
+    for performance in kept {
+        let from = newest.as_ref().unwrap_or(skill);
+        match refine(from, performance) {
+            Ok((refined, what)) => {
+                newest = Some(refined);
+                learned.push(what);
+            }
+            Err(e) => left_out.push((performance.name().to_owned(), e.to_string())),
+        }
+    }
+    Lesson {
+        skill: newest.map(Arc::new),
+        learned,
+        left_out,
+    }
+}

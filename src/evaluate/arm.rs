@@ -1,0 +1,187 @@
+//! Both daemons, real QUIC and the arm, on a virtual clock: what is left of the delay at the tip.
+
+use std::sync::Arc;
+
+use telemime_operator::demonstration::Demonstration;
+use telemime_operator::session::SessionConfig;
+use telemime_operator::task::{Outcome, Recording, Task};
+use telemime_protocol::skill::Skill;
+use telemime_robot::rig::Rig;
+use telemime_robot::servo::{Mapping, RAMP_S, Report};
+use telemime_sim::link::{Fate, Link, LinkConfig};
+
+use crate::ground::{Pair, PairError, run_virtual};
+use crate::measure::{Hand, Track, follow, is_edge, rmse_m, sample_and_hold};
+
+/// The hand rests this long before the recording begins, s: one engages at rest.
+const REST_S: f64 = 1.0;
+
+/// What a raw sample takes on the wire, headers included, bytes.
+const RAW_BYTES: usize = 74;
+
+/// The lag is looked for at these intervals, s.
+const LAG_GRID: usize = 8;
+
+/// Why an arm could not be driven.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum ArmError {
+    #[error(transparent)]
+    Ground(#[from] PairError),
+    #[error("{0}: the arm never followed; {1}")]
+    NotDriven(String, String),
+}
+
+/// The link and the arm.
+pub(super) struct Drive {
+    pub(super) rig: Rig,
+    pub(super) config: SessionConfig,
+    pub(super) link: LinkConfig,
+}
+
+/// Ways to follow the hand, in the order of [`Driven::error_2`].
+pub(super) const WAYS: [&str; 4] = [
+    "delayed, ideal tip",
+    "delayed, same arm",
+    "guarded, same arm",
+    "known ahead, same arm",
+];
+
+/// One performance, driven.
+#[derive(Debug, Clone)]
+pub(super) struct Driven {
+    /// Moments judged, 1 ms apart.
+    pub(super) moments: usize,
+    /// Σ of squared distances from the hand, in its metres, of each of [`WAYS`], m².
+    pub(super) error_2: [f64; 4],
+    /// How late, s; `None` if it may be more than was tried.
+    pub(super) lag_s: [Option<f64>; 4],
+    pub(super) scale: f64,
+    /// Ticks on which a limit acted.
+    pub(super) clamps: u32,
+    pub(super) messages: u32,
+    pub(super) duration_s: f64,
+}
+
+/// Drives the arm through one performance; the link's chances follow from `seed`.
+pub(super) fn drive(
+    d: &Demonstration,
+    skill: &Arc<Skill>,
+    drive: &Drive,
+    seed: u64,
+) -> Result<Driven, ArmError> {
+    let first_s = d.samples()[0].t_s;
+    let task = || {
+        let samples = d.samples().iter();
+        Task::replay(Recording {
+            samples: samples
+                .map(|s| telemime_operator::demonstration::Sample {
+                    t_s: s.t_s - first_s,
+                    ..*s
+                })
+                .collect(),
+            rest_s: REST_S,
+        })
+    };
+    let (reports, zero_ns, summary) = run_virtual(async {
+        let mut pair = Pair::start(&drive.rig)?;
+        let skill = Some(Arc::clone(skill));
+        let mut operator = pair.operator(task(), skill, drive.config, &drive.link, seed)?;
+        let (summary, task) = (&mut operator.done)
+            .await
+            .expect("the operator's task does not panic");
+        let zero_ns = task.zero().map(|zero| pair.to_mono(zero).0);
+        let reports = pair.robot.reports().clone();
+        Ok::<_, PairError>((reports, zero_ns, summary?))
+    })??;
+    let failed = |why: &str| ArmError::NotDriven(d.name().to_owned(), why.to_owned());
+    if let Outcome::Interrupted(why) = &summary.outcome {
+        return Err(failed(why));
+    }
+    let zero_ns = zero_ns.ok_or_else(|| failed("the recording never began"))?;
+    let engaged: Vec<&Report> = reports
+        .iter()
+        .filter(|r| r.engagement.number != 0)
+        .collect();
+    let (Some(last), Some(begin)) = (engaged.last(), engaged.first()) else {
+        return Err(failed("it was not granted"));
+    };
+    let time_s = |r: &Report| (r.at.0 - zero_ns) as f64 * 1e-9;
+    let mapping = last.mapping;
+    let tip = engaged
+        .iter()
+        .map(|r| (time_s(r), mapping.unplace(r.tip_m)))
+        .collect();
+    let truth = d
+        .samples()
+        .iter()
+        .map(|s| (s.t_s - first_s, s.position))
+        .collect();
+    let track = |points| Track::new(points).map_err(|e| failed(&e.to_string()));
+    let (tip, truth) = (track(tip)?, track(truth)?);
+    let from_s = (time_s(begin) + RAMP_S).max(0.0);
+    let counters = summary.counters;
+    let mut driven = judge(&truth, &tip, from_s, &mapping, drive, seed);
+    let judged = |r: &&&Report| (from_s..=d.duration_s()).contains(&time_s(r));
+    driven.clamps = engaged.iter().filter(judged).last().map_or(0, |r| r.clamps);
+    driven.messages = counters.messages;
+    driven.duration_s = d.duration_s() - time_s(begin);
+    Ok(driven)
+}
+
+fn judge(
+    truth: &Track,
+    tip: &Track,
+    from_s: f64,
+    mapping: &Mapping,
+    drive: &Drive,
+    seed: u64,
+) -> Driven {
+    let end_s = truth.span_s().1;
+    let grid_s: Vec<f64> = (0..((end_s - from_s) * 1e3).max(0.0) as u32)
+        .map(|i| from_s + f64::from(i) * 1e-3)
+        .collect();
+    // Every raw sample over a link of the same kind.
+    let mut link = Link::new(drive.link.clone(), seed);
+    let arrivals: Vec<_> = truth
+        .points()
+        .iter()
+        .filter_map(|(t_s, x)| match link.send((t_s * 1e9) as i64, RAW_BYTES) {
+            Fate::Deliver { at_ns } => Some((at_ns as f64 * 1e-9, *t_s, *x)),
+            Fate::Lost | Fate::Overflow => None,
+        })
+        .collect();
+    let start = truth.points()[0].1;
+    let held = |t_s: f64| sample_and_hold(&arrivals, t_s).unwrap_or(start);
+    let ideal = Track::new(grid_s.iter().map(|&t| (t, held(t))).collect());
+    let rig = &drive.rig;
+    let begin_s = tip.span_s().0.min(0.0);
+    let delayed = follow(rig, mapping, begin_s, end_s, |t| Some(Hand::from(held(t))));
+    let known = follow(rig, mapping, begin_s, end_s, |t| {
+        Some(Hand::from(truth.at(t + rig.lag_s())))
+    });
+    let ways = [
+        ideal.ok(),
+        Some(delayed.tip),
+        Some(tip.clone()),
+        Some(known.tip),
+    ];
+    let coarse: Vec<f64> = grid_s.iter().copied().step_by(LAG_GRID).collect();
+    let error_2 = |way: &Option<Track>| {
+        way.as_ref().map_or(0.0, |w| {
+            rmse_m(w, truth, &grid_s).powi(2) * grid_s.len() as f64
+        })
+    };
+    let lag_s = |way: &Option<Track>| {
+        let lag_s = way.as_ref()?.lag_behind(truth, &coarse).0;
+        Some(lag_s).filter(|lag_s| !is_edge(*lag_s))
+    };
+    Driven {
+        moments: grid_s.len(),
+        error_2: std::array::from_fn(|n| error_2(&ways[n])),
+        lag_s: std::array::from_fn(|n| lag_s(&ways[n])),
+        scale: mapping.scale,
+        clamps: 0,
+        messages: 0,
+        duration_s: 0.0,
+    }
+}

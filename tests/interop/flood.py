@@ -1,0 +1,97 @@
+"""A million datagrams of garbage against a robot process that somebody is driving: what it costs in memory, and whether the
+session and the servo noticed.
+
+Usage: flood.py PROGRAM [DATAGRAMS]
+"""
+
+import asyncio
+import multiprocessing
+import pathlib
+import random
+import socket
+import sys
+import tempfile
+import time
+
+from client import dial, fingerprint
+from drive import Circle, Hand, Robot, identity
+
+MEMORY_MIB = 16
+
+
+def throw(address, count):
+    """Random bytes, half of them nearly first packets of QUIC version 1, from ever new ports."""
+    rng, sent = random.Random(1), 0
+    packets = [rng.randbytes(rng.randrange(1, 1200)) for _ in range(500)]
+    packets += [b"\xc3\0\0\0\1\x08" + rng.randbytes(1194) for _ in range(500)]
+    while sent < count:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+            for packet in packets:
+                try:
+                    s.sendto(packet, address)
+                except OSError:
+                    time.sleep(1e-3)
+            sent += len(packets)
+
+
+def resident_mib(pid):
+    """What a process has in memory, MiB."""
+    for line in pathlib.Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1]) / 1024
+    raise ValueError("no VmRSS")
+
+
+async def session(robot, key, certificate, count):
+    async with dial(robot.host, robot.port, key, certificate, robot.fingerprint) as operator:
+        operator.greet()
+        await operator.hear("Info")
+        while operator.pings < 8:
+            await asyncio.sleep(0.02)
+        hand = Hand(operator, Circle(operator.clock_us() * 1e-6), 1)
+        hand.sample()
+        operator.say(hand.engage())
+        await operator.hear("Engaged")
+
+        def look():
+            t = operator.telemetry[-1]
+            return time.monotonic(), t["overruns"], t["dropped"]
+
+        await hand.move(1.0)
+        before, memory = look(), resident_mib(robot.process.pid)
+        await hand.move(4.0)
+        calm = look()
+        flood = multiprocessing.Process(target=throw, args=((robot.host, robot.port), count))
+        flood.start()
+        peak, told = memory, len(operator.telemetry)
+        while flood.is_alive():
+            await hand.move(0.25)
+            peak = max(peak, resident_mib(robot.process.pid))
+        flood.join()
+        flooded = look()
+        await hand.move(0.5)
+        states = {t["state"] for t in operator.telemetry[told:]}
+        rate = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in ((before, calm), (calm, flooded))]
+        print(f"{count} datagrams in {flooded[0] - calm[0]:.1f} s; resident {memory:.1f} MiB, at most {peak:.1f} MiB")
+        print(f"late ticks: {rate[0]:.1f} a second before, {rate[1]:.1f} during; states {sorted(states)}; {flooded[2]} dropped")
+        operator.say("Goodbye", end=True)
+        closed = await operator.hear("Closed")
+        assert closed["code"] == 0, closed
+        assert states <= {"Engaged", "Coasting"} and len(operator.telemetry) - told > 10, states
+        assert peak - memory < MEMORY_MIB, (memory, peak)
+        assert flooded[2] == 0, "garbage reached the session"
+
+
+def main():
+    count = int(sys.argv[2]) if len(sys.argv) > 2 else 1_000_000
+    key, certificate = identity()
+    with tempfile.TemporaryDirectory() as folder:
+        robot = Robot(sys.argv[1], pathlib.Path(folder), fingerprint(certificate))
+        try:
+            asyncio.run(session(robot, key, certificate, count))
+        finally:
+            robot.end()
+
+
+if __name__ == "__main__":
+    main()

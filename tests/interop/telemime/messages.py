@@ -1,0 +1,127 @@
+"""Every message of version 1 (§4, §5), field by field."""
+
+from . import path
+from .codec import (F32, I64, U8, U16, U32, Array, Bytes, Enum, Option, Struct, Text, Vec, WireError, decode, encode, finite, require)
+from .frames import LONGEST
+from .state import PARAMS, POSE, ROTATION, STATE, _rotation_range
+
+DATAGRAM = 1100
+ID = Array(U8, 16)
+
+
+class Knots(Bytes):
+    """Knots as bits: a block's number of knots is looked at with the message, all else once the path before it is there."""
+
+    def __init__(self, most):
+        super().__init__(DATAGRAM if most == 32 else LONGEST)
+        self.knots = most
+
+    def check(self, value):
+        try:
+            n = path.count(value)
+        except WireError as e:
+            raise WireError("Invalid", str(e)) from None
+        require(n <= self.knots, "knots", n)
+
+
+STATES = Enum("Idle", "Ready", "Engaged", "Coasting", "Holding", "Stopped")
+CAUSES = Enum(
+    "Requested", "NewsArrived", "NewsLate", "LeaseExpired", "PlanFinished",
+    "ConnectionLost", "OperatorStop", "LocalStop", "ClockStep", "Fault",
+)  # fmt: skip
+REASONS = Enum(
+    "Stopped", "AlreadyEngaged", "OldEngagement", "StaleReference", "ClockUnknown", "BadModel",
+    "BadPlan", "BadMapping", "Moving", "Diverged", "NotYours",
+)  # fmt: skip
+
+
+def _engage(m):
+    finite("scale", m["scale"], m["rotation"])
+    require(0 < m["scale"] <= 10, "scale", m["scale"])
+    require(abs(sum(c * c for c in m["rotation"]) - 1) <= 1e-3, "rotation", m["rotation"])
+    require(m["path_bound_um"] > 0, "path_bound_um", 0)
+    require(1 <= m["sample_us"] <= 1_000_000, "sample_us", m["sample_us"])
+
+
+def _info(m):
+    for name in ("speed_m_s", "accel_m_s2", "radius_m"):
+        finite(name, m[name])
+        require(m[name] > 0, name, m[name])
+    require(0 <= m["lag_s"] <= 2, "lag_s", m["lag_s"])
+
+
+def _engaged(m):
+    finite("Engaged", m["hand_m"], m["tip_m"])
+    if m["hand_q"] is not None:
+        _rotation_range("hand_q")(m)
+    _rotation_range("tip_q")(m)
+
+
+def _telemetry(m):
+    finite("Telemetry", m["tip_m"], m["q"])
+    _rotation_range("tip_q")(m)
+
+
+DRIVE = Enum(
+    ("Mirror", Struct(("state", STATE), ("model", U16), ("params", PARAMS), ("pose", POSE))),
+    ("Play", Struct(("plan", U32))),
+)
+OPERATOR_CONTROL = Enum(
+    ("Model", Struct(("id", ID), ("bytes", Bytes(524_288)))),
+    ("Plan", Struct(("id", U32), ("bytes", Bytes(131_072)))),
+    ("Engage", Struct(
+        ("engagement", U32), ("t_us", I64), ("drive", DRIVE), ("scale", F32), ("rotation", Array(F32, 4)),
+        ("path_bound_um", U32), ("sample_us", U32), ("lease_ms", U16), check=_engage)),
+    ("Path", Struct(("engagement", U32), ("state", STATE), ("first_knot", U32), ("knots", Knots(1024)))),
+    ("Release", Struct(("engagement", U32))),
+    "EmergencyStop",
+    ("Reset", Struct(("changes", U32))),
+    "Goodbye",
+)  # fmt: skip
+ROBOT_CONTROL = Enum(
+    ("Info", Struct(
+        ("name", Text(64)), ("joints", U8), ("speed_m_s", F32), ("accel_m_s2", F32), ("radius_m", F32), ("lag_s", F32),
+        ("model", Option(ID)), ("state", STATES), check=_info)),
+    ("ModelStored", Struct(("id", ID))),
+    ("PlanStored", Struct(("id", U32))),
+    ("Engaged", Struct(
+        ("engagement", U32), ("t_us", I64), ("hand_m", Array(F32, 3)), ("tip_m", Array(F32, 3)),
+        ("hand_q", Option(ROTATION)), ("tip_q", ROTATION), check=_engaged)),
+    ("Refused", Struct(("reason", REASONS))),
+    ("State", Struct(("state", STATES), ("cause", CAUSES), ("changes", U32))),
+)  # fmt: skip
+OPERATOR_DATAGRAM = Enum(
+    ("Motion", Struct(
+        ("epoch", U32), ("engagement", U32), ("seq", U32), ("lease_ms", U16), ("model", U16), ("params", PARAMS),
+        ("checksum", Option(U32)), ("state", STATE), ("pose", POSE), ("first_knot", U32), ("knots", Knots(32)))),
+    ("Go", Struct(("epoch", U32), ("engagement", U32), ("seq", U32), ("t_us", I64), ("lease_ms", U16))),
+    ("Pong", Struct(("epoch", U32), ("t1_us", I64), ("t2_us", I64), ("t3_us", I64))),
+    ("Stop", Struct(("epoch", U32))),
+    ("Clock", Struct(("epoch", U32), ("ahead_us", I64), ("dispersion_us", U32))),
+)  # fmt: skip
+ROBOT_DATAGRAM = Enum(
+    ("Ping", Struct(("epoch", U32), ("t1_us", I64))),
+    ("Telemetry", Struct(
+        ("epoch", U32), ("seq", U32), ("state", STATES), ("engagement", U32), ("t_us", I64), ("clock_uncertainty_us", U32),
+        ("age_ms", U16), ("delay_ms", U16), ("path_frontier", U32), ("received", U32), ("newest_seq", U32), ("dropped", U32),
+        ("clamps", U32), ("tick_mean_ns", U32), ("tick_p99_ns", U32), ("overruns", U32), ("tip_m", Array(F32, 3)),
+        ("tip_q", ROTATION), ("grip", Option(U8)), ("q", Vec(F32, 10)), check=_telemetry)),
+)  # fmt: skip
+
+# Who sends what, and how long it may be.
+KINDS = {
+    "operator control": (OPERATOR_CONTROL, LONGEST),
+    "robot control": (ROBOT_CONTROL, LONGEST),
+    "operator datagram": (OPERATOR_DATAGRAM, DATAGRAM),
+    "robot datagram": (ROBOT_DATAGRAM, DATAGRAM),
+}
+
+
+def read(kind, data):
+    """The message of one of KINDS."""
+    return decode(KINDS[kind][0], data, KINDS[kind][1])
+
+
+def write(kind, message):
+    """The bytes of a message of one of KINDS."""
+    return encode(KINDS[kind][0], message)
