@@ -238,6 +238,16 @@ fn operator_datagrams() {
             },
             "0201fdffe30b5402000000fafbfb00",
         ),
+        (
+            OperatorDatagram::Clock {
+                epoch: 1,
+                clock: ExternalClock {
+                    ahead_us: 1_792_000_000_000_000,
+                    dispersion_us: 50,
+                },
+            },
+            "0401fd0000e006a1bb0c0032",
+        ),
         (OperatorDatagram::Stop { epoch: 65_536 }, "03fc00000100"),
     ]);
 }
@@ -393,7 +403,7 @@ fn must_reject() {
         assert!(OperatorControl::decode(&bytes(control)).is_err(), "{why}");
     }
     for (why, datagram) in [
-        ("no such datagram", "04"),
+        ("no such datagram", "05"),
         ("long form of epoch 1", "03fb0100"),
         ("trailing byte", "030100"),
         ("cut", "01010304"),

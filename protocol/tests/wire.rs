@@ -351,6 +351,13 @@ fn operator_datagram() -> impl Strategy<Value = OperatorDatagram> {
                 t3_us,
             }
         }),
+        any::<(u32, i64, u32)>().prop_map(|(epoch, ahead_us, dispersion_us)| {
+            let clock = ExternalClock {
+                ahead_us,
+                dispersion_us,
+            };
+            OperatorDatagram::Clock { epoch, clock }
+        }),
         any::<u32>().prop_map(|epoch| OperatorDatagram::Stop { epoch }),
     ]
 }

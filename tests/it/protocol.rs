@@ -19,11 +19,13 @@ use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::{self, Frame};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
+use telemime_protocol::wire::pair::{self, AbortCode, Name, PairMessage, Transcript};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::{
-    self, Cause, Drive, Engage, Info, Message, Motion, OperatorControl, OperatorDatagram, PathTail,
-    Refusal, RobotControl, RobotDatagram, RobotState, Telemetry, WireParams, model_tag,
+    self, Cause, Drive, Engage, ExternalClock, Info, Message, Motion, OperatorControl,
+    OperatorDatagram, PathTail, Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
+    WireParams, model_tag,
 };
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo;
@@ -253,6 +255,17 @@ fn message<M: Message + PartialEq + Debug>(message: &M) -> Vec<u8> {
     bytes
 }
 
+fn name(text: &str) -> Name {
+    Name::new(text).unwrap()
+}
+
+fn pairing(message: PairMessage) -> Vec<u8> {
+    let bytes = message.encode();
+    let used = bytes.len();
+    assert_eq!(PairMessage::decode(&bytes), Ok(Some((message, used))));
+    bytes
+}
+
 fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
     let stop = message(&OperatorControl::EmergencyStop);
     let straight = Forecast::constant_velocity(&STATE.dequantise(), &PARAMS.dequantise());
@@ -378,6 +391,16 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
         ),
         ("stop", message(&OperatorDatagram::Stop { epoch: 7 })),
         (
+            "clock",
+            message(&OperatorDatagram::Clock {
+                epoch: 7,
+                clock: ExternalClock {
+                    ahead_us: 1_792_000_000_000_000,
+                    dispersion_us: 50,
+                },
+            }),
+        ),
+        (
             "ping",
             message(&RobotDatagram::Ping {
                 epoch: 7,
@@ -386,6 +409,18 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
         ),
         ("telemetry", message(&RobotDatagram::Telemetry(telemetry()))),
         ("plan", codec::encode(&plan())),
+        ("pair-offer", pairing(PairMessage::Offer(name("laptop")))),
+        (
+            "pair-commit",
+            pairing(PairMessage::Commit(
+                pair::commitment(&[0x22; 32]),
+                name("arm"),
+            )),
+        ),
+        (
+            "pair-abort",
+            pairing(PairMessage::Abort(AbortCode::Declined, "no".into())),
+        ),
     ])
 }
 
@@ -394,6 +429,14 @@ fn values() -> BTreeMap<String, String> {
     let mut say = |name: &str, value: String| {
         assert!(values.insert(name.to_owned(), value).is_none(), "{name}");
     };
+    let agreed = Transcript {
+        exporter: [0xe5; 32],
+        operator: [0x0a; 32],
+        robot: [0x0b; 32],
+        operator_nonce: [0x11; 32],
+        robot_nonce: [0x22; 32],
+    };
+    say("pairing code", agreed.code().to_string());
     let vector = |v: &Vector3<f64>| format!("{:.9} {:.9} {:.9}", v.x, v.y, v.z);
 
     let state = STATE.dequantise();

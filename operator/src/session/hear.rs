@@ -98,6 +98,9 @@ impl Session {
                     t2_us: t_us,
                     t3_us: t_us,
                 });
+                if let Some(clock) = self.external {
+                    self.datagram(&OperatorDatagram::Clock { epoch, clock });
+                }
             }
             Ok(RobotDatagram::Telemetry(telemetry)) if telemetry.epoch == self.epoch => {
                 if let Activity::Mirror(mirror) = &mut self.activity

@@ -23,7 +23,8 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::Version;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::v1::{
-    Drive, Engage, Info, Message, OperatorControl, OperatorDatagram, PathTail, Refusal, RobotState,
+    Drive, Engage, ExternalClock, Info, Message, OperatorControl, OperatorDatagram, PathTail,
+    Refusal, RobotState,
 };
 
 use crate::recognise::{Recogniser, Verdict};
@@ -69,6 +70,7 @@ pub struct Session {
     gate: Gate,
     interval: Interval,
     recogniser: Option<Recogniser>,
+    external: Option<ExternalClock>,
     verdict: Option<Verdict>,
     activity: Activity,
     engagement: u32,
@@ -104,6 +106,7 @@ impl Session {
             gate: Gate::default(),
             interval: Interval::default(),
             recogniser: None,
+            external: None,
             verdict: None,
             activity: Activity::Nothing,
             engagement: 0,
@@ -133,6 +136,11 @@ impl Session {
     pub fn watched_by(mut self, recogniser: Option<Recogniser>) -> Self {
         self.recogniser = recogniser;
         self
+    }
+
+    /// What our disciplined clock says now, relative to the session clock, if we have one.
+    pub fn set_external(&mut self, external: Option<ExternalClock>) {
+        self.external = external;
     }
 
     /// What the robot said of itself.

@@ -5,6 +5,7 @@ pub mod codec;
 pub mod frame;
 pub mod hello;
 pub mod knots;
+pub mod pair;
 mod params;
 pub mod state;
 pub mod turn;

@@ -299,6 +299,22 @@ pub enum OperatorDatagram {
         /// The session's epoch.
         epoch: u32,
     },
+    /// What a disciplined clock at the operator says; with every [`OperatorDatagram::Pong`], if it has one.
+    Clock {
+        /// The session's epoch.
+        epoch: u32,
+        /// What it says.
+        clock: ExternalClock,
+    },
+}
+
+/// How the session clock lies to one that is kept right from outside (PTP, chrony).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ExternalClock {
+    /// Time since 1970 on that clock (as `CLOCK_REALTIME` counts it) less the session clock, µs.
+    pub ahead_us: i64,
+    /// How wrong that clock may be, µs.
+    pub dispersion_us: u32,
 }
 
 /// The newest state of the hand, and the knots of its path that are not yet acknowledged.
@@ -542,7 +558,7 @@ impl OperatorDatagram {
                 motion.params.check("motion.params")?;
                 motion.pose.check()
             }
-            Self::Go { .. } | Self::Pong { .. } | Self::Stop { .. } => Ok(()),
+            Self::Go { .. } | Self::Pong { .. } | Self::Stop { .. } | Self::Clock { .. } => Ok(()),
         }
     }
 }
