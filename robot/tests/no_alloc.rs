@@ -77,6 +77,7 @@ impl Bench {
         self.order(Order::Extend {
             ticket: ticket(number),
             lease,
+            bent: None,
         });
     }
 

@@ -174,6 +174,7 @@ fn what_belongs_to_another_engagement_moves_nothing() {
         bench.order(Order::Extend {
             ticket: ticket(1),
             lease,
+            bent: None,
         });
         let report = bench.tick_at(ms);
         assert!(

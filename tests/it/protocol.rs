@@ -342,6 +342,7 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
                 seq: 43,
                 t_us: 3_200_000,
                 lease_ms: 650,
+                bend: None,
             }),
         ),
         (

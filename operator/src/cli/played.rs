@@ -19,6 +19,8 @@ pub(super) struct Played {
     tip: Vec<(f64, Vector3<f64>)>,
     /// The same for its orientation, where that is followed.
     turn: Vec<(f64, UnitQuaternion<f64>)>,
+    /// What the robot was told to make of the plan, if a hand corrected it.
+    bends: Vec<session::Bent>,
     /// Ticks on which a limit held the arm back.
     clamps: u32,
 }
@@ -46,6 +48,7 @@ impl Played {
             engaged: None,
             tip: Vec::new(),
             turn: Vec::new(),
+            bends: Vec::new(),
             clamps: 0,
         }
     }
@@ -76,6 +79,7 @@ impl Played {
                 });
             }
             session::Event::Telemetry(telemetry) => self.take(telemetry),
+            session::Event::Bent(bent) => self.bends.push(*bent),
             _ => {}
         }
     }
@@ -104,13 +108,18 @@ impl Played {
         let (sent, followed): (Vec<_>, Vec<_>) = self
             .tip
             .iter()
-            .filter(|(t_s, _)| *t_s <= end_s)
-            .map(|(t_s, tip)| (self.curve.position_at(*t_s), *tip))
+            .map(|(t_s, tip)| (self.meant_at(*t_s), *tip))
+            .filter(|((plan_s, _), _)| *plan_s <= end_s)
+            .map(|((_, meant), tip)| (meant, tip))
             .unzip();
         if sent.len() < 2 {
             return None;
         }
-        let demonstrations = self.demonstrations.as_ref().map(|aligned| {
+        let uncorrected = self
+            .demonstrations
+            .as_ref()
+            .filter(|_| self.bends.is_empty());
+        let demonstrations = uncorrected.map(|aligned| {
             Scores::of_demonstrations(aligned, |t_s| self.tip_at(t_s.clamp(0.0, end_s)))
         });
         Some(Event::Played {
@@ -119,13 +128,36 @@ impl Played {
             rebuilt_to_tip: Scores::of(&sent, &followed),
             demonstrations_to_tip: demonstrations,
             turn_to_tip: (!self.turn.is_empty()).then(|| {
-                TurnScores::of(
-                    self.turn
-                        .iter()
-                        .filter_map(|(t_s, q)| Some(self.curve.orientation_at(*t_s)?.angle_to(q))),
-                )
+                TurnScores::of(self.turn.iter().filter_map(|(t_s, q)| {
+                    let plan_s = self.meant_at(*t_s).0;
+                    Some(self.curve.orientation_at(plan_s)?.angle_to(q))
+                }))
             }),
         })
+    }
+
+    /// The plan's time (s) and where the hand belongs (m), `t_s` after the engage: linear between what the robot was told.
+    fn meant_at(&self, t_s: f64) -> (f64, Vector3<f64>) {
+        let engaged_us = self.engaged.as_ref().map_or(0, |engaged| engaged.t_us);
+        let at_s = |bent: &session::Bent| (bent.at.0 / 1000 - engaged_us) as f64 * 1e-6;
+        let after = self.bends.partition_point(|bent| at_s(bent) <= t_s);
+        let Some(before) = after.checked_sub(1).map(|i| &self.bends[i]) else {
+            return (t_s, self.curve.position_at(t_s));
+        };
+        let (plan_s, offset) = match self.bends.get(after) {
+            Some(next) => {
+                let u = (t_s - at_s(before)) / (at_s(next) - at_s(before));
+                (
+                    before.plan_s + (next.plan_s - before.plan_s) * u,
+                    before.offset_m.lerp(&next.offset_m, u),
+                )
+            }
+            None => (
+                before.plan_s + before.rate * (t_s - at_s(before)),
+                before.offset_m,
+            ),
+        };
+        (plan_s, self.curve.position_at(plan_s) + offset)
     }
 
     /// Linear between what was heard.

@@ -29,6 +29,8 @@ pub struct SessionConfig {
     pub path_bound_m: Option<f64>,
     /// Prediction gain κ in [0, 1].
     pub gain: f64,
+    /// How exactly the hand means its displacement when it corrects what is played, m: the smaller, the more it bends it.
+    pub hand_sigma_m: f64,
     /// Tip metres per hand metre; `None` derives it from the demonstrations and the arm's limits.
     pub scale: Option<f64>,
     /// Hand axes to the robot's base axes.
@@ -44,6 +46,7 @@ impl Default for SessionConfig {
             future_bound: FutureBound::Relative(0.6),
             path_bound_m: None,
             gain: 1.0,
+            hand_sigma_m: 0.02,
             scale: None,
             rotation: UnitQuaternion::identity(),
         }

@@ -35,6 +35,7 @@ impl Session {
                 if let Activity::Play {
                     plan,
                     engaged: engaged @ false,
+                    ..
                 } = &mut self.activity
                     && *plan == id
                 {
@@ -52,6 +53,9 @@ impl Session {
                 tip_q,
             } => {
                 self.before = None;
+                if let Some(correction) = self.correction() {
+                    correction.begin(Stamp(t_us.saturating_mul(1000)));
+                }
                 self.events.push_back(Event::Engaged {
                     engagement,
                     t_us,

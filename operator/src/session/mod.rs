@@ -5,6 +5,7 @@
 
 mod adapt;
 mod config;
+mod correct;
 mod hand;
 mod hear;
 mod mirror;
@@ -26,8 +27,10 @@ use telemime_protocol::wire::v1::{
 use crate::recognise::{Recogniser, Verdict};
 
 pub use config::{FutureBound, HandSample, SessionConfig, default_scale};
+pub use correct::{Bent, Change, LOST_S, Leeway};
 pub use said::{Counters, Event, Output};
 
+use correct::Correction;
 use hand::Hand;
 use mirror::Mirror;
 
@@ -44,6 +47,8 @@ enum Activity {
     Play {
         plan: u32,
         engaged: bool,
+        /// What the hand makes of it, if it may.
+        correction: Option<Box<Correction>>,
     },
 }
 
@@ -156,8 +161,18 @@ impl Session {
         self.config.path_bound_m.unwrap_or(derived).max(1e-4)
     }
 
-    /// The hand, live. Samples out of order or not finite are dropped and counted.
+    /// The hand, live: mirrored, or, where a skill is played that may be corrected, a hand that holds on to it until
+    /// [`Session::let_go`]. Samples out of order or not finite are dropped and counted.
     pub fn handle_sample(&mut self, now: Stamp, sample: HandSample) {
+        if matches!(
+            self.activity,
+            Activity::Play {
+                correction: Some(_),
+                ..
+            }
+        ) {
+            return self.correct(now, &sample);
+        }
         let Some(hand) = &mut self.hand else {
             self.hand = Hand::first(&sample);
             return;
@@ -186,14 +201,86 @@ impl Session {
         if mirror.future_changed(arrival, self.config.future_bound)
             || silent_s >= self.config.max_silence_s
         {
-            // Within the shortest interval the news waits, and what is then said is the newest.
-            self.urgent = silent_s < self.config.min_interval_s;
-            if !self.urgent {
-                self.speak(now);
-            }
+            self.speak_soon(now);
         }
         if let Some(tail) = backlog {
             self.path(tail);
+        }
+    }
+
+    fn correct(&mut self, now: Stamp, sample: &HandSample) {
+        let ahead = self.ahead(now);
+        let Some(correction) = self.correction() else {
+            return;
+        };
+        let (taken, change) = correction.take(now, ahead, sample);
+        let changed = correction.has_changed(now, ahead);
+        if !taken {
+            self.counters.dropped += 1;
+            return;
+        }
+        self.counters.samples += 1;
+        if let Some(change) = change {
+            self.tell_of(change, now);
+        } else if changed {
+            self.speak_soon(now);
+        }
+    }
+
+    /// The hand that corrects what is played lets go of it: the skill goes on.
+    pub fn let_go(&mut self, now: Stamp) {
+        self.loose(now, Change::Released);
+    }
+
+    fn loose(&mut self, now: Stamp, change: Change) {
+        let ahead = self.ahead(now);
+        if self
+            .correction()
+            .is_some_and(|correction| correction.let_go(now, ahead))
+        {
+            self.tell_of(change, now);
+        }
+    }
+
+    /// What a hand does to a plan cannot wait for the shortest interval.
+    fn tell_of(&mut self, change: Change, now: Stamp) {
+        self.events.push_back(Event::Correction(change));
+        self.speak(now);
+    }
+
+    /// Looks whether time alone has changed what the robot should know.
+    fn look_after(&mut self, now: Stamp) {
+        let ahead = self.ahead(now);
+        let Some(correction) = self.correction() else {
+            return;
+        };
+        if correction.is_lost(now) {
+            return self.loose(now, Change::Lost);
+        }
+        correction.look(now, ahead);
+        if correction.has_changed(now, ahead) {
+            self.speak_soon(now);
+        }
+    }
+
+    fn correction(&mut self) -> Option<&mut Correction> {
+        match &mut self.activity {
+            Activity::Play { correction, .. } => correction.as_deref_mut(),
+            _ => None,
+        }
+    }
+
+    /// When what is said now takes effect at the arm.
+    fn ahead(&self, now: Stamp) -> Stamp {
+        let lag_s = self.info.as_ref().map_or(0.0, |info| f64::from(info.lag_s));
+        now.offset_by_secs(self.delay_s + lag_s)
+    }
+
+    /// Within the shortest interval the news waits, and what is then said is the newest.
+    fn speak_soon(&mut self, now: Stamp) {
+        self.urgent = now.secs_since(self.last_sent) < self.config.min_interval_s;
+        if !self.urgent {
+            self.speak(now);
         }
     }
 
@@ -245,15 +332,29 @@ impl Session {
         self.last_sent = now;
     }
 
-    /// Sends a motion and plays it as soon as the robot has it.
-    pub fn play(&mut self, plan: &PosePlan) {
+    /// Sends a motion and plays it as soon as the robot has it. With the skill's `leeway` the hand may correct it:
+    /// [`Session::handle_sample`], [`Session::let_go`].
+    pub fn play(&mut self, plan: &PosePlan, leeway: Option<&Leeway>) {
         if self.refuses() {
             return;
         }
+        let correction = match leeway.map(|leeway| (plan.curve(), leeway)) {
+            Some((Ok(curve), leeway)) => Some(Box::new(Correction::new(
+                curve,
+                leeway.clone(),
+                &self.config,
+            ))),
+            Some((Err(_), _)) => {
+                self.events.push_back(Event::Refused(Refusal::BadPlan));
+                return;
+            }
+            None => None,
+        };
         self.plans += 1;
         self.activity = Activity::Play {
             plan: self.plans,
             engaged: false,
+            correction,
         };
         self.control(&OperatorControl::Plan {
             id: self.plans,
@@ -317,6 +418,9 @@ impl Session {
         if self.next_word().is_some_and(|due| now >= due) {
             self.speak(now);
         }
+        if self.next_look().is_some_and(|due| now >= due) {
+            self.look_after(now);
+        }
     }
 
     /// What to send next.
@@ -335,9 +439,16 @@ impl Session {
         let word = self
             .next_word()
             .map(|due| (due, "confirm before the silence grows too long"));
-        match (stop, word) {
-            (Some(a), Some(b)) => Some(if b.0 < a.0 { b } else { a }),
-            (a, b) => a.or(b),
+        let look = self
+            .next_look()
+            .map(|due| (due, "see what the hand makes of the plan"));
+        [stop, word, look].into_iter().flatten().min_by_key(|w| w.0)
+    }
+
+    fn next_look(&self) -> Option<Stamp> {
+        match &self.activity {
+            Activity::Play { correction, .. } => correction.as_ref()?.due(),
+            _ => None,
         }
     }
 
@@ -349,10 +460,13 @@ impl Session {
             } else {
                 self.config.max_silence_s
             })),
-            Activity::Play { engaged: true, .. } => Some(
-                self.last_sent
-                    .offset_by_secs(self.config.max_silence_s.min(GO_S)),
-            ),
+            Activity::Play { engaged: true, .. } => Some(self.last_sent.offset_by_secs(
+                self.config.max_silence_s.min(if self.urgent {
+                    self.config.min_interval_s
+                } else {
+                    GO_S
+                }),
+            )),
         }
     }
 
@@ -362,15 +476,23 @@ impl Session {
         self.urgent = false;
         self.seq += 1;
         let lease_ms = (self.config.lease_s * 1e3) as u16;
+        let ahead = self.ahead(now);
         let datagram = match &mut self.activity {
             Activity::Nothing => return,
-            Activity::Play { .. } => OperatorDatagram::Go {
-                epoch: self.epoch,
-                engagement: self.engagement,
-                seq: self.seq,
-                t_us: now.0 / 1000,
-                lease_ms,
-            },
+            Activity::Play { correction, .. } => {
+                let told = correction.as_mut().and_then(|c| c.tell(now, ahead));
+                if let Some((_, bent)) = told {
+                    self.events.push_back(Event::Bent(bent));
+                }
+                OperatorDatagram::Go {
+                    epoch: self.epoch,
+                    engagement: self.engagement,
+                    seq: self.seq,
+                    t_us: now.0 / 1000,
+                    lease_ms,
+                    bend: told.map(|(wire, _)| wire),
+                }
+            }
             Activity::Mirror(mirror) => {
                 let skill = self.skill.as_deref().filter(|_| self.model_stored);
                 let Some(mut motion) = mirror.motion(skill, now, self.delay_s) else {

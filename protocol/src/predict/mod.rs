@@ -2,15 +2,17 @@
 //!
 //! [`HandState`] is all that is known of the hand, [`Model`] what was learned, [`Params`] what the
 //! operator adapts; [`Model::forecast`] is a pure function of the three, and keeps nothing.
-//! [`TurnState`], [`TurnModel`] and [`TurnForecast`] are the same for its orientation.
+//! [`Bend`] is what a hand makes of a plan that is played. [`TurnState`], [`TurnModel`] and [`TurnForecast`] are the same for its orientation.
 
 mod ahead;
+mod bend;
 mod forecast;
 mod model;
 mod state;
 mod turn;
 
 pub use ahead::{Ahead, Knot, Way};
+pub use bend::{Bend, Held, LET_GO_TAU_S, MAX_RATE, PUSH_REACH_S};
 pub use forecast::{Forecast, Params, ParamsError, Prediction};
 pub use model::{
     BLOCK, Calibration, Model, ModelError, Posterior, Regression, Standardisation, TARGETS, TEMPER,

@@ -11,6 +11,7 @@ fn go(bench: &Bench, seq: u32, ms_ago: i64) -> OperatorDatagram {
         seq,
         t_us: bench.stamp(ms_ago).0 / 1000,
         lease_ms: 650,
+        bend: None,
     }
 }
 
