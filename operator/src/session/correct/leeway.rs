@@ -94,7 +94,7 @@ mod tests {
         let leeway = Leeway::of(&motion, skill.duration_s());
         let least = LEAST_DEVIATION_M * LEAST_DEVIATION_M;
         for i in 0..=50 {
-            let t_s = skill.duration_s() * f64::from(i) / 50.0;
+            let t_s = f64::from(i) * STEP_S;
             let eigen = leeway.at(t_s).symmetric_eigenvalues();
             assert!(eigen.min() >= least * (1.0 - 1e-9), "{eigen} at {t_s} s");
             let given = motion.at(t_s).covariance;

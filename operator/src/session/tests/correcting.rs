@@ -69,7 +69,7 @@ impl Bench {
 
     /// Moves the hand evenly to `way` from where it took hold, and keeps it there, 33 ms a sample.
     fn push(&mut self, way: Vector3<f64>, moving: u32, still: u32) {
-        for i in 1..=moving + still {
+        for i in 0..=moving + still {
             let u = (f64::from(i) / f64::from(moving)).min(1.0);
             self.sample(Vector3::new(5.0, 5.0, 5.0) + way * u);
         }
