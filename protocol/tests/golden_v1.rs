@@ -2,6 +2,7 @@
 
 use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
+use telemime_protocol::wire::knots::KnotBlock;
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::*;
@@ -60,6 +61,7 @@ fn operator_control() {
             scale: 0.125,
             rotation: [0.5, -0.5, 0.5, 0.5],
             path_bound_um: 20_000,
+            sample_us: 33_333,
             lease_ms: 650,
         })
     };
@@ -87,30 +89,26 @@ fn operator_control() {
         (
             engage(mirror(WirePose::default())),
             "0203fc0ead250000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ffc8800000 \
-             0000003e0000003f000000bf0000003f0000003ffb204efb8a02",
+             0000003e0000003f000000bf0000003f0000003ffb204efb3582fb8a02",
         ),
         (
             engage(mirror(POSE)),
             "0203fc0ead250000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ffc880 \
              01fb204efb6ff50004010203fffefd7f8000050607ffc8800164 \
-             0000003e0000003f000000bf0000003f0000003ffb204efb8a02",
+             0000003e0000003f000000bf0000003f0000003ffb204efb3582fb8a02",
         ),
         (
             engage(Drive::Play { plan: 300 }),
-            "0203fc0ead250001fb2c010000003e0000003f000000bf0000003f0000003ffb204efb8a02",
+            "0203fc0ead250001fb2c010000003e0000003f000000bf0000003f0000003ffb204efb3582fb8a02",
         ),
         (
             OperatorControl::Path(PathTail {
                 engagement: 3,
                 state: STATE,
                 first_knot: 300,
-                knots: vec![WireKnot {
-                    dt: 7,
-                    dx: [1, -1, 2],
-                    v: [0, 3, -3],
-                }],
+                knots: KnotBlock(vec![0x80, 0x7f, 0xff]),
             }),
-            "0303fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb2c010107020104000605",
+            "0303fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb2c0103807fff",
         ),
         (OperatorControl::Release { engagement: 3 }, "0403"),
         (OperatorControl::EmergencyStop, "05"),
@@ -212,31 +210,21 @@ fn operator_datagrams() {
         lease_ms: 650,
         bend,
     };
-    let knots = vec![
-        WireKnot {
-            dt: 1,
-            dx: [0, -1, 1],
-            v: [-64, 64, 0],
-        },
-        WireKnot {
-            dt: 6600,
-            dx: [i32::MAX, i32::MIN, 126],
-            v: [-126, 125, -125],
-        },
-    ];
+    // Two of them, whatever they are.
+    let knots = KnotBlock(vec![0x5a, 0x00, 0xc3, 0xfe]);
     pinned(vec![
         (
             motion(Some(0xdead_beef), WirePose::default(), knots),
             "000103fc70110100fb8a02fb1032ffc88001fcefbeaddefc0ead2500fbd007fb8713fb50c30301ff \
-             02fe03fd28ce3c7f80000000fa02010001027f8000fbc819fcfefffffffcfffffffffbfc00fbfb00faf9",
+             02fe03fd28ce3c7f80000000fa045a00c3fe",
         ),
         (
-            motion(None, WirePose::default(), vec![]),
+            motion(None, WirePose::default(), KnotBlock::default()),
             "000103fc70110100fb8a02fb1032ffc88000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
              ce3c7f80000000fa00",
         ),
         (
-            motion(None, POSE, vec![]),
+            motion(None, POSE, KnotBlock::default()),
             "000103fc70110100fb8a02fb1032ffc88000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
              ce3c7f800001fb204efb6ff50004010203fffefd7f8000050607ffc8800164fa00",
         ),

@@ -6,11 +6,13 @@ use nalgebra::Vector3;
 use proptest::collection::vec;
 use proptest::option;
 use proptest::prelude::*;
+use telemime_protocol::checkpoint::path::{PathGrid, PathKnot};
 use telemime_protocol::predict::{HandState, Params};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
+use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::{MAX_POSITION_M, POSITION_STEP_M, WireState};
 use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::*;
@@ -96,17 +98,21 @@ fn engage() -> impl Strategy<Value = Engage> {
         1e-6..10.0f32,
         unit(),
         1..=u32::MAX,
+        1..=MAX_SAMPLE_US,
         any::<u16>(),
     )
         .prop_map(
-            |(engagement, t_us, drive, scale, rotation, path_bound_um, lease_ms)| Engage {
-                engagement,
-                t_us,
-                drive,
-                scale,
-                rotation,
-                path_bound_um,
-                lease_ms,
+            |(engagement, t_us, drive, scale, rotation, path_bound_um, sample_us, lease_ms)| {
+                Engage {
+                    engagement,
+                    t_us,
+                    drive,
+                    scale,
+                    rotation,
+                    path_bound_um,
+                    sample_us,
+                    lease_ms,
+                }
             },
         )
 }
@@ -121,7 +127,7 @@ fn operator_control() -> impl Strategy<Value = OperatorControl> {
         any::<u32>().prop_map(|engagement| OperatorControl::Release { engagement }),
         Just(OperatorControl::EmergencyStop),
         any::<u32>().prop_map(|changes| OperatorControl::Reset { changes }),
-        (any::<u32>(), state(), any::<u32>(), vec(knot(), 0..40)).prop_map(
+        (any::<u32>(), state(), any::<u32>(), block()).prop_map(
             |(engagement, state, first_knot, knots)| OperatorControl::Path(PathTail {
                 engagement,
                 state,
@@ -232,15 +238,62 @@ fn robot_control() -> impl Strategy<Value = RobotControl> {
     ]
 }
 
-/// As many knots as fit whatever they are; of small ones [`MAX_KNOTS`] do.
-const FITTING_KNOTS: usize = 27;
+const CODE_BOUND_M: f64 = 0.02;
 
-fn knot() -> impl Strategy<Value = WireKnot> {
-    (any::<u32>(), any::<[i32; 3]>(), any::<[i32; 3]>()).prop_map(|(dt, dx, v)| WireKnot {
+fn code(sample_us: u32) -> PathCode {
+    PathCode {
+        grid: PathGrid::for_bound(CODE_BOUND_M).expect("a grid"),
+        sample_us,
+    }
+}
+
+/// A path: knots as an encoder makes them, some of them wild, all after the epoch.
+fn knots(most: usize) -> impl Strategy<Value = Vec<PathKnot>> {
+    let small = prop::array::uniform6(-40..40i32);
+    let any = prop::array::uniform6(-(1i32 << 30)..=1i32 << 30);
+    let dt = prop_oneof![
+        6 => (1..30i64, -2..=2i64).prop_map(|(n, off)| (10_000 * n) / 3 + off),
+        2 => 1..200_000i64,
+        1 => 1i64..1i64 << 31,
+    ];
+    let one = (
         dt,
-        dx,
-        v,
+        prop_oneof![9 => small, 1 => any],
+        prop::bool::weighted(0.1),
+    );
+    vec(one, 0..=most).prop_map(|steps| {
+        let (mut knots, mut tick, mut x) = (Vec::<PathKnot>::new(), 0, [0; 3]);
+        for (dt, [a, b, c, p, q, r], start) in steps {
+            tick += dt;
+            let limit = 1 << 30;
+            let add = |x: i32, by: i32| (x + by).clamp(-limit, limit);
+            x = [add(x[0], a), add(x[1], b), add(x[2], c)];
+            let start = start || knots.is_empty();
+            let shift = if start {
+                1
+            } else {
+                PathGrid::<3>::slope_shift(dt)
+            };
+            let v = [p, q, r].map(|v| v >> shift << shift);
+            knots.push(PathKnot { tick, x, v, start });
+        }
+        knots
     })
+}
+
+/// Blocks that decode, and any bytes.
+fn block() -> impl Strategy<Value = KnotBlock> {
+    let real = (state(), knots(MAX_KNOTS)).prop_map(|(state, knots)| {
+        let mut state = WireState { t_us: 0, ..state };
+        state.t_us = knots.first().map_or(0, |k| k.tick * 10);
+        KnotBlock::pack(&state, code(33_333), &[], &knots).expect("a path can travel")
+    });
+    let fits = |b: &KnotBlock| b.0.len() <= 600 && b.count(MAX_KNOTS).is_ok();
+    let any = vec(any::<u8>(), 0..40).prop_map(KnotBlock);
+    prop_oneof![
+        real.prop_filter("short", fits),
+        any.prop_filter("a count", fits)
+    ]
 }
 
 fn motion() -> impl Strategy<Value = Motion> {
@@ -250,7 +303,7 @@ fn motion() -> impl Strategy<Value = Motion> {
         params(),
         option::of(any::<u32>()),
         (state(), pose()),
-        vec(knot(), 0..=FITTING_KNOTS),
+        block(),
     )
         .prop_map(
             |(
@@ -544,10 +597,17 @@ proptest! {
 
 #[test]
 fn counts_beyond_their_limits_are_refused() {
-    let knot = WireKnot {
-        dt: 1,
-        dx: [1; 3],
-        v: [1; 3],
+    let knot = |n: i64| PathKnot {
+        tick: 3_333 * (n - 2_000),
+        x: [1; 3],
+        v: [0; 3],
+        start: n == 0,
+    };
+    let block = |knots: usize| {
+        let knots: Vec<_> = (0..knots as i64).map(knot).collect();
+        let state = WireState::quantise(&HandState::first(Stamp(0), Vector3::zeros()));
+        let state = state.expect("within range");
+        KnotBlock::pack(&state, code(33_333), &[], &knots).expect("a path can travel")
     };
     let motion = |knots: usize| {
         let state = HandState::first(Stamp(0), Vector3::zeros());
@@ -562,7 +622,7 @@ fn counts_beyond_their_limits_are_refused() {
             state: WireState::quantise(&state).expect("within range"),
             pose: WirePose::default(),
             first_knot: 0,
-            knots: vec![knot; knots],
+            knots: block(knots),
         })
     };
     let decoded = |knots| OperatorDatagram::decode(&motion(knots).encode());
@@ -571,6 +631,24 @@ fn counts_beyond_their_limits_are_refused() {
         decoded(MAX_KNOTS + 1),
         Err(DecodeError::Invalid {
             field: "motion.knots",
+            ..
+        })
+    ));
+    let tail = |knots| {
+        OperatorControl::Path(PathTail {
+            engagement: 1,
+            state: WireState::quantise(&HandState::first(Stamp(0), Vector3::zeros()))
+                .expect("within range"),
+            first_knot: 0,
+            knots: block(knots),
+        })
+    };
+    let decoded = |knots| OperatorControl::decode(&tail(knots).encode());
+    assert_eq!(decoded(MAX_TAIL_KNOTS), Ok(tail(MAX_TAIL_KNOTS)));
+    assert!(matches!(
+        decoded(MAX_TAIL_KNOTS + 1),
+        Err(DecodeError::Invalid {
+            field: "path.knots",
             ..
         })
     ));

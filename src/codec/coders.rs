@@ -2,12 +2,16 @@
 //!
 //! Every coder but the live one ends in a [`Plan`], so that all have the same entropy coding.
 
+use anyhow::Context as _;
 use nalgebra::{Vector3, Vector4};
 use serde::Serialize;
-use telemime_protocol::checkpoint::path::{PathDecoder, PathEncoder, PathKnot, TICK_NS, tick_of};
+use telemime_protocol::checkpoint::path::{
+    self, Origin, PathDecoder, PathEncoder, PathKnot, TICK_NS, tick_of,
+};
 use telemime_protocol::checkpoint::{Checkpoint, CheckpointError, Grid, MAX_POINTS, Plan, select};
 use telemime_protocol::spline::BSpline;
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::v1::MAX_TAIL_KNOTS;
 
 /// What chooses the points and reads them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -74,9 +78,10 @@ impl Recording {
 #[derive(Clone, Debug)]
 pub(super) struct Coded {
     pub(super) points: usize,
-    /// As a plan; for the live coder, as knots on the wire.
+    /// As a plan; for the live coder, as knots by the stream, in one block.
     pub(super) bytes: usize,
-    /// With whole bytes for every number, as datagrams have them.
+    /// With whole bytes for every number; for the live coder, in a block for every two knots, about as motions
+    /// bring them.
     pub(super) whole_bytes: usize,
     /// One for each sample.
     pub(super) decoded: Vec<Vector3<f64>>,
@@ -114,33 +119,35 @@ pub(super) fn live(of: &Recording, bound_m: f64) -> anyhow::Result<Coded> {
         // NaN shows in the table: there is no such sample.
         decoder.eval(on_tick).map_or(x * f64::NAN, |jet| jet.x)
     });
-    let bytes = knot_bytes(&knots);
+    let spans = (of.t.len() - 1) as f64;
+    let interval_us = (of.duration_s() / spans * 1e6).round().max(1.0) as u32;
+    let block_len = |length: usize| {
+        let blocks = knots.chunks(length).enumerate();
+        blocks
+            .map(|(i, block)| block_bytes(interval_us, &knots[..i * length], block))
+            .sum::<Option<usize>>()
+            .context("a knot that cannot travel")
+    };
     Ok(Coded {
         points: knots.len(),
-        bytes,
-        whole_bytes: bytes,
+        bytes: block_len(MAX_TAIL_KNOTS)?,
+        whole_bytes: block_len(KNOTS_A_MESSAGE)?,
         decoded: decoded.collect(),
     })
 }
 
-/// What the knots of a path take in messages, each once: `dt`, `dx` and `v` of the protocol's §8.
-fn knot_bytes(knots: &[PathKnot]) -> usize {
-    let mut before: Option<&PathKnot> = None;
-    let mut bytes = 0;
-    for knot in knots {
-        let (tick, x) = before.map_or((knot.tick, knot.x), |k| (k.tick, k.x));
-        bytes += varint((knot.tick - tick).unsigned_abs() << 1);
-        for (now, before) in knot.x.iter().zip(x) {
-            bytes += signed_varint(i64::from(*now) - i64::from(before));
-        }
-        bytes += knot
-            .v
-            .iter()
-            .map(|v| signed_varint(i64::from(*v)))
-            .sum::<usize>();
-        before = Some(knot);
-    }
-    bytes
+/// About the knots of a hand that a message brings.
+const KNOTS_A_MESSAGE: usize = 2;
+
+/// A block of knots as in the protocol's §8, with its length.
+fn block_bytes(interval_us: u32, before: &[PathKnot], block: &[PathKnot]) -> Option<usize> {
+    let first = block.first()?;
+    let origin = Origin {
+        tick: first.tick,
+        x: first.x,
+    };
+    let bytes = path::pack(interval_us, &origin, before, block)?;
+    Some(varint(bytes.len() as u64) + bytes.len())
 }
 
 fn varint(n: u64) -> usize {

@@ -28,6 +28,10 @@ const CARRY_S: f64 = 5.0;
 const ASIDE_M: f64 = 0.08;
 const AGAINST_M: f64 = 0.3;
 
+/// How long it takes to push aside, and how long it stays there, s.
+const RISE_S: f64 = 0.4;
+const HOLD_S: f64 = 0.8;
+
 /// Share of performances that the region drawn is to hold.
 const SHARE: f64 = 0.9;
 
@@ -72,6 +76,15 @@ struct Told {
     offset: Vector3<f64>,
 }
 
+/// At the engage.
+const UNBENT: Told = Told {
+    at_s: 0.0,
+    plan_s: 0.0,
+    rate: 1.0,
+    share: 0.0,
+    offset: Vector3::new(0.0, 0.0, 0.0),
+};
+
 /// A performance to learn from.
 pub(super) fn demonstration(seed: u64, index: u32) -> Vec<Sample> {
     let path = carry(seed, index, GOAL_M, CARRY_S).into_iter();
@@ -88,12 +101,12 @@ pub(super) fn hand(args: &Args, material: &Material) -> anyhow::Result<PathBuf> 
         let x = |t_s| recording.position_at(t_s);
         (x(t_s + 0.1) - x(t_s - 0.1)) / 0.2
     };
-    // To the side: along the axis that the motion goes along least.
+    // To the side: along the axis that the motion goes along least while it is pushed.
     let aside = |t_s: f64| {
-        let along = velocity(t_s).map(f64::abs);
-        let mut way = [0.0; 3];
-        way[along.imin()] = ASIDE_M;
-        way
+        let way = recording.position_at(t_s + RISE_S + HOLD_S) - recording.position_at(t_s);
+        let mut aside = [0.0; 3];
+        aside[way.map(f64::abs).imin()] = ASIDE_M;
+        aside
     };
     let against = |t_s: f64| -> [f64; 3] {
         let direction = velocity(t_s).try_normalize(1e-6);
@@ -101,11 +114,11 @@ pub(super) fn hand(args: &Args, material: &Material) -> anyhow::Result<PathBuf> 
     };
     let (early_s, middle_s) = (0.1 * span_s, 0.45 * span_s);
     // The plan has waited for a while by then.
-    let late_s = 0.75 * span_s + 2.2;
+    let late_s = 0.62 * span_s + 2.0;
     let pushes = [
-        push(args.seed, early_s, aside(early_s), 0.4, 0.8),
+        push(args.seed, early_s, aside(early_s), RISE_S, HOLD_S),
         push(args.seed, middle_s, against(middle_s), 0.8, 1.2),
-        push(args.seed, late_s, aside(0.75 * span_s), 0.4, 0.8),
+        push(args.seed, late_s, aside(0.62 * span_s), RISE_S, HOLD_S),
     ];
     let samples: Vec<_> = pushes
         .iter()
@@ -225,9 +238,7 @@ fn at(told: &[Told], t_s: f64) -> Told {
         return Told {
             at_s: t_s,
             plan_s: t_s,
-            rate: 1.0,
-            share: 0.0,
-            offset: Vector3::zeros(),
+            ..UNBENT
         };
     };
     let (plan_s, offset) = match told.get(after) {
@@ -319,11 +330,12 @@ fn figure(
         )
     };
     let within = |t: &&Told| t.at_s <= grid.last().copied().unwrap_or_default();
-    let share = told.iter().filter(within).map(|t| (t.at_s, t.share));
-    let rate = told.iter().filter(within).map(|t| (t.at_s, t.rate));
+    let all = || std::iter::once(&UNBENT).chain(told.iter().filter(within));
+    let share = all().map(|t| (t.at_s, t.share));
+    let rate = all().map(|t| (t.at_s, t.rate));
     let ratios = over(
         "what the robot is told".into(),
-        "share of 1".into(),
+        "share, rate".into(),
         vec![
             Layer::new("the hand's share", ORANGE, Shape::Line(share.collect())),
             Layer::new("rate of the plan", BLACK, Shape::Line(rate.collect())),

@@ -19,11 +19,11 @@ use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::{self, Frame};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
-use telemime_protocol::wire::knots;
+use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::{
-    Cause, Drive, Engage, Info, Message, Motion, OperatorControl, OperatorDatagram, PathTail,
+    self, Cause, Drive, Engage, Info, Message, Motion, OperatorControl, OperatorDatagram, PathTail,
     Refusal, RobotControl, RobotDatagram, RobotState, Telemetry, WireParams, model_tag,
 };
 use telemime_robot::rig::{Rig, RigOptions};
@@ -73,23 +73,33 @@ const BEND: WireBend = WireBend {
 
 const TIP_Q: WireRotation = WireRotation([7_869, -3_976, 0]);
 
-const KNOTS: [PathKnot; 2] = [
+/// Two of them in the motion, the third by the stream.
+const KNOTS: [PathKnot; 3] = [
     PathKnot {
         tick: 240_000,
-        x: [70, -40, 500],
-        v: [3, -4, 0],
+        x: [35, -20, 250],
+        v: [2, -4, 0],
         start: true,
     },
     PathKnot {
         tick: 270_000,
-        x: [80, -41, 502],
+        x: [40, -20, 251],
         v: [0, 2, 0],
+        start: false,
+    },
+    PathKnot {
+        tick: 280_002,
+        x: [43, -21, 251],
+        v: [16, 0, -8],
         start: false,
     },
 ];
 
-fn grid() -> PathGrid {
-    PathGrid::for_bound(0.02).unwrap()
+fn code() -> PathCode {
+    PathCode {
+        grid: PathGrid::for_bound(0.02).unwrap(),
+        sample_us: 33_333,
+    }
 }
 
 fn motion(checksum: Option<u32>) -> Motion {
@@ -103,8 +113,8 @@ fn motion(checksum: Option<u32>) -> Motion {
         checksum,
         state: STATE,
         pose: WirePose::default(),
-        first_knot: 3,
-        knots: knots::pack(&STATE, grid(), &KNOTS).unwrap(),
+        first_knot: 0,
+        knots: KnotBlock::pack(&STATE, code(), &[], &KNOTS[..2]).unwrap(),
     }
 }
 
@@ -261,6 +271,7 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
             scale: 0.125,
             rotation,
             path_bound_um: 20_000,
+            sample_us: 33_333,
             lease_ms: 650,
         })
     };
@@ -303,8 +314,8 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
             message(&OperatorControl::Path(PathTail {
                 engagement: 1,
                 state: STATE,
-                first_knot: 3,
-                knots: motion(None).knots,
+                first_knot: 2,
+                knots: KnotBlock::pack(&STATE, code(), &KNOTS[..2], &KNOTS[2..]).unwrap(),
             })),
         ),
         ("reset", message(&OperatorControl::Reset { changes: 9 })),
@@ -348,7 +359,7 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
                     turn: Some(TURN),
                     grip: Some(200),
                 },
-                knots: Vec::new(),
+                knots: KnotBlock::default(),
                 ..motion(None)
             })),
         ),
@@ -458,13 +469,13 @@ fn values() -> BTreeMap<String, String> {
         format!("{:08x}", checksum(&forecast, None)),
     );
 
-    let mut path = PathDecoder::new(grid(), 8);
-    knots::unpack(&STATE, grid(), &motion(None).knots)
-        .zip(KNOTS)
-        .for_each(|(found, sent)| {
-            assert_eq!(found, sent);
-            path.append(&found).unwrap();
-        });
+    let mut path = PathDecoder::new(code().grid, 8);
+    let knots = motion(None)
+        .knots
+        .unpack(&STATE, code(), &[], v1::MAX_KNOTS);
+    let knots = knots.unwrap();
+    assert_eq!(knots, KNOTS[..2]);
+    knots.iter().for_each(|knot| path.append(knot).unwrap());
     let jet = path.eval(Stamp(2_500_000_000)).unwrap();
     say("path x(2.5)", vector(&jet.x));
     say("path v(2.5)", vector(&jet.v));
@@ -595,6 +606,7 @@ fn a_plan_that_does_not_begin_at_zero_is_refused() {
         scale: 0.1,
         rotation: [1.0, 0.0, 0.0, 0.0],
         path_bound_um: 1000,
+        sample_us: 33_333,
         lease_ms: 650,
     }));
     assert_eq!(

@@ -5,7 +5,7 @@ use telemime_protocol::predict::{Forecast, HandState, Params, TurnForecast, Turn
 use telemime_protocol::skill::Skill;
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WirePose, WireTurn, quantise_grip};
-use telemime_protocol::wire::v1::WireParams;
+use telemime_protocol::wire::v1::{MAX_SAMPLE_US, WireParams};
 
 use super::HandSample;
 
@@ -44,6 +44,30 @@ impl Hand {
         }
         self.grip = grip(sample).or(self.grip);
         true
+    }
+}
+
+/// How often the hand is sampled: the median of the last intervals, so that a pause or a hole says nothing.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Interval {
+    recent_us: [u32; 15],
+    count: usize,
+}
+
+impl Interval {
+    /// A sample came this long after the one before.
+    pub(super) fn take(&mut self, interval_s: f64) {
+        self.recent_us[self.count % self.recent_us.len()] = (interval_s * 1e6).round() as u32;
+        self.count += 1;
+    }
+
+    /// In µs, within what an `Engage` allows; 10 ms before there is one.
+    pub(super) fn us(&self) -> u32 {
+        let mut known = self.recent_us;
+        let known = &mut known[..self.count.min(self.recent_us.len())];
+        known.sort_unstable();
+        let median = known.get(known.len() / 2);
+        median.map_or(10_000, |us| (*us).clamp(1, MAX_SAMPLE_US))
     }
 }
 

@@ -4,13 +4,13 @@ use std::collections::VecDeque;
 
 use nalgebra::Vector3;
 use telemime_protocol::checkpoint::CheckpointError;
-use telemime_protocol::checkpoint::path::{PathEncoder, PathKnot};
+use telemime_protocol::checkpoint::path::{CONTEXT, PathEncoder, PathKnot};
 use telemime_protocol::predict::{HandState, Params, TurnState, checksum};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
-use telemime_protocol::wire::knots;
+use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
-use telemime_protocol::wire::v1::{Drive, MAX_TAIL_KNOTS, Motion, PathTail, WireKnot, model_tag};
+use telemime_protocol::wire::v1::{Drive, MAX_TAIL_KNOTS, Motion, PathTail, model_tag};
 
 use super::FutureBound;
 use super::adapt::Adaptation;
@@ -54,6 +54,9 @@ struct Unacknowledged {
 pub(super) struct Mirror {
     hand: Hand,
     path: PathEncoder,
+    code: PathCode,
+    /// The last knots the robot holds: those to come are written with them in mind.
+    held: VecDeque<PathKnot>,
     unacknowledged: VecDeque<Unacknowledged>,
     first_unacknowledged: u32,
     places: Adaptation<HandState>,
@@ -65,17 +68,24 @@ pub(super) struct Mirror {
 }
 
 impl Mirror {
+    /// `path` is its bound, m, and the interval of the samples, µs.
     pub(super) fn new(
         hand: Hand,
-        path_bound_m: f64,
+        (path_bound_m, sample_us): (f64, u32),
         gain: f64,
         skill: Option<&Skill>,
     ) -> Result<Self, CheckpointError> {
         // The bound both ends derive their grid from is a whole number of µm.
         let path_bound_m = (path_bound_m * 1e6).round() * 1e-6;
+        let path = PathEncoder::new(path_bound_m)?;
         Ok(Self {
             hand,
-            path: PathEncoder::new(path_bound_m)?,
+            code: PathCode {
+                grid: path.grid(),
+                sample_us,
+            },
+            path,
+            held: VecDeque::with_capacity(CONTEXT + 1),
             unacknowledged: VecDeque::new(),
             first_unacknowledged: 0,
             places: Adaptation::of_places(
@@ -119,7 +129,12 @@ impl Mirror {
     pub(super) fn acknowledge(&mut self, frontier: u32) {
         let known = frontier.saturating_sub(self.first_unacknowledged) as usize;
         let known = known.min(self.unacknowledged.len());
-        self.unacknowledged.drain(..known);
+        for gone in self.unacknowledged.drain(..known) {
+            self.held.push_back(gone.knot);
+            if self.held.len() > CONTEXT {
+                self.held.pop_front();
+            }
+        }
         self.first_unacknowledged += known as u32;
     }
 
@@ -179,13 +194,7 @@ impl Mirror {
         // Only an origin is wanted, and one that can travel wherever the hand is.
         let state = WireState::quantise(&HandState::first(self.hand.place.t, Vector3::zeros()))?;
         let count = self.unacknowledged.len().min(MAX_TAIL_KNOTS);
-        let knots: Vec<_> = self
-            .unacknowledged
-            .iter()
-            .take(count)
-            .map(|u| u.knot)
-            .collect();
-        let knots = knots::pack(&state, self.path.grid(), &knots).filter(|k| !k.is_empty())?;
+        let knots = self.packed(&state, 0, count).filter(|k| !k.is_empty())?;
         let first_knot = self.first_unacknowledged;
         self.acknowledge(first_knot + count as u32);
         Some(PathTail {
@@ -263,19 +272,17 @@ impl Mirror {
     }
 
     /// The knots for a message sent now, without a gap, and the number of the first.
-    fn due_knots(&mut self, state: &WireState, now: Stamp, delay_s: f64) -> (u32, Vec<WireKnot>) {
+    fn due_knots(&mut self, state: &WireState, now: Stamp, delay_s: f64) -> (u32, KnotBlock) {
         let overdue = |u: &Unacknowledged| now.secs_since(u.sent) > 2.0 * delay_s + PATIENCE_S;
         let start = self
             .unacknowledged
             .iter()
             .position(|u| u.copies < COPIES || overdue(u));
         let start = start.unwrap_or(self.unacknowledged.len());
-        let due = || start..self.unacknowledged.len().min(start + KNOTS_PER_MESSAGE);
-        let knots: Vec<_> = self.unacknowledged.range(due()).map(|u| u.knot).collect();
-        let packed = knots::pack(state, self.path.grid(), &knots);
+        let end = self.unacknowledged.len().min(start + KNOTS_PER_MESSAGE);
+        let packed = self.packed(state, start, end);
         if packed.is_some() {
-            let due = due();
-            for sent in self.unacknowledged.range_mut(due) {
+            for sent in self.unacknowledged.range_mut(start..end) {
                 sent.copies = sent.copies.saturating_add(1);
                 sent.sent = now;
             }
@@ -284,6 +291,14 @@ impl Mirror {
             self.first_unacknowledged + start as u32,
             packed.unwrap_or_default(),
         )
+    }
+
+    /// The unacknowledged knots `from..to` as they travel.
+    fn packed(&self, state: &WireState, from: usize, to: usize) -> Option<KnotBlock> {
+        let unacknowledged = self.unacknowledged.range(..to).map(|u| u.knot);
+        let known: Vec<_> = self.held.iter().copied().chain(unacknowledged).collect();
+        let (before, due) = known.split_at(self.held.len() + from);
+        KnotBlock::pack(state, self.code, before, due)
     }
 
     fn model(&self, skill: Option<&Skill>) -> u16 {

@@ -31,7 +31,7 @@ pub use correct::{Bent, Change, LOST_S, Leeway};
 pub use said::{Counters, Event, Output};
 
 use correct::Correction;
-use hand::Hand;
+use hand::{Hand, Interval};
 use mirror::Mirror;
 
 /// While an emergency stop is not confirmed, it is repeated at this interval, s.
@@ -62,6 +62,7 @@ pub struct Session {
     state: RobotState,
     changes: u32,
     hand: Option<Hand>,
+    interval: Interval,
     recogniser: Option<Recogniser>,
     verdict: Option<Verdict>,
     activity: Activity,
@@ -92,6 +93,7 @@ impl Session {
             state: RobotState::Idle,
             changes: 0,
             hand: None,
+            interval: Interval::default(),
             recogniser: None,
             verdict: None,
             activity: Activity::Nothing,
@@ -183,6 +185,8 @@ impl Session {
             return;
         }
         let hand = *hand;
+        self.interval
+            .take(hand.place.t.secs_since(previous.place.t));
         self.recognise(&hand);
         let Activity::Mirror(mirror) = &mut self.activity else {
             return;
@@ -318,7 +322,8 @@ impl Session {
             return;
         };
         let skill = self.skill.as_deref().filter(|_| self.model_stored);
-        let Ok(mirror) = Mirror::new(hand, self.path_bound_m(), self.config.gain, skill) else {
+        let path = (self.path_bound_m(), self.interval.us());
+        let Ok(mirror) = Mirror::new(hand, path, self.config.gain, skill) else {
             self.events.push_back(Event::Refused(Refusal::BadMapping));
             return;
         };
@@ -528,6 +533,7 @@ impl Session {
                 rotation.k as f32,
             ],
             path_bound_um: (self.path_bound_m() * 1e6).round() as u32,
+            sample_us: self.interval.us(),
             lease_ms: (self.config.lease_s * 1e3) as u16,
         };
         self.control(&OperatorControl::Engage(engage));

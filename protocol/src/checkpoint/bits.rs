@@ -90,10 +90,7 @@ impl<'a> BitReader<'a> {
     }
 
     pub(super) fn signed(&mut self, k: u32) -> Option<i64> {
-        let n = self.golomb(k)?;
-        // Below 2⁴⁰, so neither half wraps.
-        let half = (n >> 1) as i64;
-        Some(if n & 1 == 0 { half } else { -half - 1 })
+        self.golomb(k).map(unzigzag)
     }
 
     /// Whether only the filling of the last byte is left, and is zero.
@@ -106,6 +103,12 @@ impl<'a> BitReader<'a> {
 /// 0, −1, 1, −2, … as 0, 1, 2, 3, …
 pub(super) fn zigzag(n: i64) -> u64 {
     (n << 1 ^ n >> 63) as u64
+}
+
+/// What [`zigzag`] was given, of a number below 2⁶³.
+pub(super) fn unzigzag(n: u64) -> i64 {
+    let half = (n >> 1) as i64;
+    if n & 1 == 0 { half } else { -half - 1 }
 }
 
 /// How many bits [`BitWriter::golomb`] takes.

@@ -1,72 +1,92 @@
-//! Path knots as they ride in a motion: differences, small enough for one byte each most of the time.
+//! Path knots as they ride in a message: a block of bits.
 
+use serde::{Deserialize, Serialize};
+
+use super::codec::DecodeError;
 use super::state::WireState;
-use super::v1::WireKnot;
-use crate::checkpoint::path::{PathGrid, PathKnot, tick_of};
+use crate::checkpoint::path::{self, BlockError, Origin, PathGrid, PathKnot, tick_of};
 
-/// The tick and the position (in steps of `grid`) that the first knot of a message is relative to.
-fn origin(state: &WireState, grid: PathGrid) -> (i64, [i32; 3]) {
+/// Knots of a path as bits: [`KnotBlock::pack`] and [`KnotBlock::unpack`]. Without knots it is empty.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct KnotBlock(pub Vec<u8>);
+
+/// What both ends know of a path before its first knot.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PathCode {
+    /// The grid of the path's bound.
+    pub grid: PathGrid,
+    /// `Engage::sample_us`: the interval of the hand's samples, µs.
+    pub sample_us: u32,
+}
+
+/// The tick and the position (in steps of `grid`) that the first knot of a path is relative to.
+fn origin(state: &WireState, grid: PathGrid) -> Origin {
     let state = state.dequantise();
     let steps = state.x / grid.step_m();
     // `as` saturates; both ends compute it from the same integers.
-    (
+    Origin {
         // Rounded as knots are: one at the state's own instant must not lie after it.
-        tick_of(state.t),
-        [
+        tick: tick_of(state.t),
+        x: [
             steps.x.round() as i32,
             steps.y.round() as i32,
             steps.z.round() as i32,
         ],
-    )
-}
-
-fn difference(a: [i32; 3], b: [i32; 3]) -> [i32; 3] {
-    core::array::from_fn(|d| a[d].wrapping_sub(b[d]))
-}
-
-/// `knots` (in order) relative to `state`; `None` if one lies after the state or too far before it.
-pub fn pack(state: &WireState, grid: PathGrid, knots: &[PathKnot]) -> Option<Vec<WireKnot>> {
-    let (mut tick, mut x) = origin(state, grid);
-    let mut packed = Vec::with_capacity(knots.len());
-    for (i, knot) in knots.iter().enumerate() {
-        let ticks = if i == 0 {
-            tick - knot.tick
-        } else {
-            knot.tick - tick
-        };
-        let ticks = u32::try_from(ticks).ok().filter(|&n| n < 1 << 31)?;
-        packed.push(WireKnot {
-            dt: ticks << 1 | u32::from(knot.start),
-            dx: difference(knot.x, x),
-            v: knot.v,
-        });
-        (tick, x) = (knot.tick, knot.x);
     }
-    Some(packed)
 }
 
-/// What [`pack`] packed. Any input gives some knots; `PathDecoder::append` judges them.
-pub fn unpack<'a>(
-    state: &WireState,
-    grid: PathGrid,
-    knots: &'a [WireKnot],
-) -> impl Iterator<Item = PathKnot> + use<'a> {
-    let (mut tick, mut x) = origin(state, grid);
-    knots.iter().enumerate().map(move |(i, knot)| {
-        let ticks = i64::from(knot.dt >> 1);
-        tick = if i == 0 {
-            tick.saturating_sub(ticks)
-        } else {
-            tick.saturating_add(ticks)
+impl KnotBlock {
+    /// `knots` (in order), given those `before` them on the path, of which the last
+    /// [`CONTEXT`](path::CONTEXT) count; `state` is the message's, and counts if there are none.
+    ///
+    /// `None` for knots that cannot travel: see [`path::pack`].
+    pub fn pack(
+        state: &WireState,
+        code: PathCode,
+        before: &[PathKnot],
+        knots: &[PathKnot],
+    ) -> Option<Self> {
+        let origin = origin(state, code.grid);
+        path::pack(code.sample_us, &origin, before, knots).map(Self)
+    }
+
+    /// What [`KnotBlock::pack`] packed, at most `limit` knots. They are in range; `PathDecoder::append` judges
+    /// them.
+    ///
+    /// # Errors
+    /// [`BlockError`]: not a block, or not one that comes after these knots.
+    pub fn unpack(
+        &self,
+        state: &WireState,
+        code: PathCode,
+        before: &[PathKnot],
+        limit: usize,
+    ) -> Result<Vec<PathKnot>, BlockError> {
+        let origin = origin(state, code.grid);
+        path::unpack(code.sample_us, &origin, before, &self.0, limit)
+    }
+
+    /// How many knots it claims to hold, at most `limit`.
+    ///
+    /// # Errors
+    /// [`BlockError`].
+    pub fn count(&self, limit: usize) -> Result<usize, BlockError> {
+        path::count(&self.0, limit)
+    }
+
+    /// Whether it holds no knot.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    pub(super) fn check(&self, field: &'static str, limit: usize) -> Result<(), DecodeError> {
+        let why = match self.count(limit) {
+            Ok(_) => return Ok(()),
+            Err(BlockError::TooMany { .. }) => "more knots than allowed",
+            Err(_) => "not a block of knots",
         };
-        x = core::array::from_fn(|d| x[d].wrapping_add(knot.dx[d]));
-        PathKnot {
-            tick,
-            x,
-            v: knot.v,
-            start: knot.dt & 1 == 1,
-        }
-    })
+        Err(DecodeError::Invalid { field, why })
+    }
 }
 
 #[cfg(test)]
@@ -76,42 +96,60 @@ mod tests {
     use crate::time::Stamp;
     use nalgebra::Vector3;
 
+    fn code() -> PathCode {
+        PathCode {
+            grid: PathGrid::for_bound(0.02).unwrap(),
+            sample_us: 33_333,
+        }
+    }
+
+    fn state(ns: i64) -> WireState {
+        let state = HandState::first(Stamp(ns), Vector3::new(0.4, -0.2, 2.5));
+        WireState::quantise(&state).unwrap()
+    }
+
     #[test]
     fn a_knot_at_the_states_own_instant_can_always_travel() {
-        let grid = PathGrid::for_bound(0.02).unwrap();
         for ns in 0..20_000 {
             let t = Stamp(3_000_000_000 + ns);
-            let state = HandState::first(t, Vector3::new(0.4, -0.2, 2.5));
-            let state = WireState::quantise(&state).unwrap();
+            let state = state(t.0);
             let knot = PathKnot {
                 tick: tick_of(t),
-                x: [70, -40, 500],
+                x: [35, -20, 250],
                 v: [0; 3],
-                start: false,
+                start: true,
             };
-            let packed = pack(&state, grid, &[knot]).expect("no later than the state");
-            assert_eq!(unpack(&state, grid, &packed).next(), Some(knot), "{ns} ns");
+            let packed = KnotBlock::pack(&state, code(), &[], &[knot]).expect("not later");
+            let found = packed.unpack(&state, code(), &[], 1).unwrap();
+            assert_eq!(found, [knot], "{ns} ns");
         }
     }
 
     #[test]
-    fn knots_come_back_and_a_later_one_is_refused() {
-        let grid = PathGrid::for_bound(0.02).unwrap();
-        let state = HandState::first(Stamp(3_000_000_000), Vector3::new(0.4, -0.2, 2.5));
-        let state = WireState::quantise(&state).unwrap();
-        let knot = |ms: i64, x, start| PathKnot {
+    fn knots_come_back_and_one_later_than_its_origin_is_refused() {
+        let state = state(3_000_000_000);
+        let knot = |ms: i64, x, v, start| PathKnot {
             tick: ms * 100,
             x,
-            v: [3, -400, 0],
+            v,
             start,
         };
         let knots = [
-            knot(2_400, [70, -40, 500], true),
-            knot(2_700, [80, -41, 502], false),
-            knot(3_000, [81, 0, 1], false),
+            knot(2_400, [35, -20, 250], [2, -400, 0], true),
+            knot(2_700, [40, -20, 251], [4, -400, 0], false),
+            knot(3_000, [40, 0, 1], [0; 3], false),
         ];
-        let packed = pack(&state, grid, &knots).unwrap();
-        assert_eq!(unpack(&state, grid, &packed).collect::<Vec<_>>(), knots);
-        assert_eq!(pack(&state, grid, &[knot(3_001, [0; 3], true)]), None);
+        let all = KnotBlock::pack(&state, code(), &[], &knots).unwrap();
+        assert_eq!(all.unpack(&state, code(), &[], 3).unwrap(), knots);
+        assert_eq!(all.count(3), Ok(3));
+        let last = KnotBlock::pack(&state, code(), &knots[..2], &knots[2..]).unwrap();
+        assert_eq!(
+            last.unpack(&state, code(), &knots[..2], 3).unwrap(),
+            knots[2..]
+        );
+        assert!(last.0.len() < all.0.len());
+        let late = [knot(3_001, [0; 3], [0; 3], true)];
+        assert_eq!(KnotBlock::pack(&state, code(), &[], &late), None);
+        assert!(KnotBlock::pack(&state, code(), &knots, &late).is_some());
     }
 }

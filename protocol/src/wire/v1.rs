@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::bend::WireBend;
 use super::codec::{self, DecodeError};
 use super::frame::MAX_FRAME_LEN;
+use super::knots::KnotBlock;
 use super::state::WireState;
 use super::turn::{WirePose, WireRotation};
 use crate::predict::Params;
@@ -26,6 +27,9 @@ pub const MAX_KNOTS: usize = 32;
 
 /// Most path knots in one [`PathTail`].
 pub const MAX_TAIL_KNOTS: usize = 1024;
+
+/// Longest interval of samples in an [`Engage`], µs.
+pub const MAX_SAMPLE_US: u32 = 1_000_000;
 
 /// Most joints in a [`Telemetry`].
 pub const MAX_JOINTS: usize = 10;
@@ -96,6 +100,8 @@ pub struct Engage {
     pub rotation: [f32; 4],
     /// Bound of the path knots, µm: their quantisation steps follow from it.
     pub path_bound_um: u32,
+    /// Interval of the hand's samples, µs, in 1 ..= 10⁶: the knots' times are counted in it. A guess is enough.
+    pub sample_us: u32,
     /// First lease, ms.
     pub lease_ms: u16,
 }
@@ -320,7 +326,7 @@ pub struct Motion {
     /// Number of the first of `knots` in the engagement's path.
     pub first_knot: u32,
     /// Unacknowledged knots of the path in order, the oldest first.
-    pub knots: Vec<WireKnot>,
+    pub knots: KnotBlock,
 }
 
 /// `predict::Params` in steps of 1/255.
@@ -361,24 +367,12 @@ impl WireParams {
 pub struct PathTail {
     /// The engagement whose path this is.
     pub engagement: u32,
-    /// What the first of `knots` is relative to.
+    /// What the path's first knot is relative to.
     pub state: WireState,
     /// Number of the first of `knots` in the engagement's path.
     pub first_knot: u32,
     /// Knots in order, at most [`MAX_TAIL_KNOTS`].
-    pub knots: Vec<WireKnot>,
-}
-
-/// A knot of the path, relative to the one before it in the message; [`super::knots`] converts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct WireKnot {
-    /// Distance in time: twice the ticks, plus 1 if the path starts afresh here. The first knot counts
-    /// backwards from the message's state, the others forwards from the knot before.
-    pub dt: u32,
-    /// Position minus that of the knot before (the first: minus the message's state), in steps.
-    pub dx: [i32; 3],
-    /// Tangent, in steps.
-    pub v: [i32; 3],
+    pub knots: KnotBlock,
 }
 
 /// Robot → operator, datagrams.
@@ -507,6 +501,11 @@ impl OperatorControl {
                     "not a unit quaternion",
                 )?;
                 require(engage.path_bound_um > 0, "engage.path_bound_um", "zero")?;
+                require(
+                    (1..=MAX_SAMPLE_US).contains(&engage.sample_us),
+                    "engage.sample_us",
+                    "outside 1 to 1000000",
+                )?;
                 match &engage.drive {
                     Drive::Mirror { state, pose, .. } => {
                         state.check()?;
@@ -516,11 +515,7 @@ impl OperatorControl {
                 }
             }
             Self::Path(tail) => {
-                require(
-                    tail.knots.len() <= MAX_TAIL_KNOTS,
-                    "path.knots",
-                    "more than 1024",
-                )?;
+                tail.knots.check("path.knots", MAX_TAIL_KNOTS)?;
                 tail.state.check()
             }
             Self::Release { .. } | Self::EmergencyStop | Self::Reset { .. } | Self::Goodbye => {
@@ -570,11 +565,7 @@ impl OperatorDatagram {
     fn check(&self) -> Result<(), DecodeError> {
         match self {
             Self::Motion(motion) => {
-                require(
-                    motion.knots.len() <= MAX_KNOTS,
-                    "motion.knots",
-                    "more than 32",
-                )?;
+                motion.knots.check("motion.knots", MAX_KNOTS)?;
                 motion.state.check()?;
                 motion.pose.check()
             }

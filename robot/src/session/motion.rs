@@ -5,10 +5,10 @@ use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid};
 use telemime_protocol::predict::{Forecast, HandState, Params, TurnForecast, checksum};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::bend::WireBend;
-use telemime_protocol::wire::knots;
+use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WireTurn, dequantise_grip};
-use telemime_protocol::wire::v1::{Motion, PathTail, Refusal, WireKnot, model_tag};
+use telemime_protocol::wire::v1::{MAX_TAIL_KNOTS, Motion, PathTail, Refusal, model_tag};
 
 use super::Session;
 use crate::servo::{Bent, Lease, Order};
@@ -22,7 +22,7 @@ struct Impossible;
 /// A mirror engagement: the path received so far.
 #[derive(Debug)]
 pub struct Mirror {
-    grid: PathGrid,
+    code: PathCode,
     path: PathDecoder,
     frontier: u32,
     newest_t: Stamp,
@@ -192,12 +192,13 @@ impl Session {
 }
 
 impl Mirror {
-    /// An empty path on the grid of `bound_um`; `None` if there is no such grid.
-    pub(super) fn new(bound_um: u32) -> Option<Self> {
+    /// An empty path on the grid of `bound_um`, of samples at intervals of `sample_us`; `None` if there is no such
+    /// grid.
+    pub(super) fn new(bound_um: u32, sample_us: u32) -> Option<Self> {
         let grid = PathGrid::for_bound(f64::from(bound_um) * 1e-6).ok()?;
         let path = PathDecoder::new(grid, PATH_KNOTS);
         Some(Self {
-            grid,
+            code: PathCode { grid, sample_us },
             path,
             frontier: 0,
             newest_t: Stamp(i64::MIN),
@@ -215,13 +216,21 @@ impl Mirror {
         &self.path
     }
 
-    fn take_knots(&mut self, state: &WireState, first_knot: u32, packed: &[WireKnot]) {
+    fn take_knots(&mut self, state: &WireState, first_knot: u32, block: &KnotBlock) {
         // A message that begins beyond the frontier leaves a gap: its knots come again.
         let Some(known) = self.frontier.checked_sub(first_knot) else {
             return;
         };
-        for knot in knots::unpack(state, self.grid, packed).skip(known as usize) {
-            if self.path.append(&knot).is_err() {
+        let known = known as usize;
+        // What is forgotten is older than any block is long.
+        let Some(before) = self.path.before(known) else {
+            return;
+        };
+        let Ok(knots) = block.unpack(state, self.code, &before, MAX_TAIL_KNOTS) else {
+            return;
+        };
+        for knot in knots.iter().skip(known) {
+            if self.path.append(knot).is_err() {
                 return;
             }
             self.frontier += 1;

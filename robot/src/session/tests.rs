@@ -2,11 +2,11 @@ use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
-use telemime_protocol::checkpoint::path::{PathEncoder, PathKnot, TICK_NS};
+use telemime_protocol::checkpoint::path::{PathEncoder, PathGrid, PathKnot, TICK_NS};
 use telemime_protocol::checkpoint::select;
 use telemime_protocol::predict::{HandState, Params};
 use telemime_protocol::skill::{Skill, example};
-use telemime_protocol::wire::knots;
+use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::WirePose;
 use telemime_protocol::wire::v1::{Motion, WireParams};
@@ -227,6 +227,7 @@ impl Bench {
             scale: 0.1,
             rotation: [1.0, 0.0, 0.0, 0.0],
             path_bound_um: 20_000,
+            sample_us: 33_333,
             lease_ms: 650,
         }
     }
@@ -270,7 +271,7 @@ impl Bench {
             state: WireState::quantise(&moving(self.stamp(ms_ago))).unwrap(),
             pose: WirePose::default(),
             first_knot: 0,
-            knots: Vec::new(),
+            knots: KnotBlock::default(),
         }
     }
 

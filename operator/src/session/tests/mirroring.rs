@@ -4,8 +4,9 @@ use super::*;
 use nalgebra::UnitQuaternion;
 use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid, TICK_NS, tick_of};
 use telemime_protocol::predict::{Forecast, checksum};
-use telemime_protocol::wire::knots;
+use telemime_protocol::wire::knots::PathCode;
 use telemime_protocol::wire::v1::model_tag;
+use telemime_protocol::wire::v1::{MAX_DATAGRAM_LEN, MAX_KNOTS, MAX_TAIL_KNOTS};
 
 use crate::recognise::{RecogniseOptions, Recogniser, Verdict};
 
@@ -36,6 +37,7 @@ fn a_request_carries_the_hand_and_the_mapping() {
     };
     assert_eq!((engage.engagement, engage.lease_ms), (1, 650));
     assert_eq!((engage.scale, engage.path_bound_um), (0.2, 12_300));
+    assert_eq!(engage.sample_us, 33_000, "what the samples say");
     let q = config.rotation.as_ref();
     let expected = [q.w, q.i, q.j, q.k].map(|v| v as f32);
     assert_eq!(engage.rotation, expected);
@@ -230,6 +232,14 @@ fn a_hand_out_of_range_is_not_sent_and_does_no_harm() {
     assert_eq!(bench.session.state(), RobotState::Engaged);
 }
 
+/// How the bench's path is written: [`Bench::sample`] takes one every 33 ms.
+fn code(bound_m: f64) -> PathCode {
+    PathCode {
+        grid: PathGrid::for_bound(bound_m).unwrap(),
+        sample_us: 33_000,
+    }
+}
+
 /// A hand for some seconds over a link that loses what `lost` says, acknowledged `delay` samples late:
 /// the path the robot ends with, the samples, and the knots made.
 fn streamed(
@@ -242,8 +252,8 @@ fn streamed(
         ..bound(0.05)
     };
     let mut bench = Bench::engaged(config, None);
-    let grid = PathGrid::for_bound(BOUND_M).unwrap();
-    let mut path = PathDecoder::new(grid, 4096);
+    let code = code(BOUND_M);
+    let mut path = PathDecoder::new(code.grid, 4096);
     let (mut frontier, mut sent, mut carried) = (0u32, 0, 0);
     let mut acknowledgements = std::collections::VecDeque::from([0; 6]);
     let mut samples = Vec::new();
@@ -255,15 +265,17 @@ fn streamed(
         samples.push((bench.now, x));
         for motion in bench.motions() {
             sent += 1;
-            carried += motion.knots.len();
+            carried += motion.knots.count(MAX_KNOTS).unwrap();
             if lost(sent) {
                 continue;
             }
             let Some(known) = frontier.checked_sub(motion.first_knot) else {
                 continue;
             };
-            for knot in knots::unpack(&motion.state, grid, &motion.knots).skip(known as usize) {
-                path.append(&knot).unwrap();
+            let before = path.before(known as usize).unwrap();
+            let knots = motion.knots.unpack(&motion.state, code, &before, MAX_KNOTS);
+            for knot in knots.unwrap().iter().skip(known as usize) {
+                path.append(knot).unwrap();
                 frontier += 1;
             }
         }
@@ -299,7 +311,7 @@ fn the_robot_ends_with_the_whole_path_whatever_is_lost() {
             let error_m = (path.eval(tick).expect("no hole").x - x).norm();
             assert!(error_m <= 0.005, "{name}: {error_m} m off");
         }
-        assert!(covered > 265, "{name}: {covered} of 300 samples");
+        assert!(covered > 255, "{name}: {covered} of 300 samples");
         if name == "nothing" {
             assert!(
                 carried <= 2 * made as usize,
@@ -319,8 +331,9 @@ fn what_is_not_acknowledged_is_sent_again() {
 }
 
 /// What the robot makes of the path tails among `control`.
-fn by_stream(control: &[OperatorControl], grid: PathGrid) -> PathDecoder {
-    let mut path = PathDecoder::new(grid, 4096);
+fn by_stream(control: &[OperatorControl], bound_m: f64) -> PathDecoder {
+    let code = code(bound_m);
+    let mut path = PathDecoder::new(code.grid, 4096);
     let mut frontier = 0;
     for message in control {
         let OperatorControl::Path(tail) = message else {
@@ -331,8 +344,12 @@ fn by_stream(control: &[OperatorControl], grid: PathGrid) -> PathDecoder {
             (1, frontier),
             "in order"
         );
-        for knot in knots::unpack(&tail.state, grid, &tail.knots) {
-            path.append(&knot).unwrap();
+        let before = path.before(0).unwrap();
+        let knots = tail
+            .knots
+            .unpack(&tail.state, code, &before, MAX_TAIL_KNOTS);
+        for knot in &knots.unwrap() {
+            path.append(knot).unwrap();
             frontier += 1;
         }
     }
@@ -346,7 +363,6 @@ fn a_path_that_no_datagram_delivers_goes_by_the_stream_to_its_last_sample() {
         path_bound_m: Some(BOUND_M),
         ..bound(0.05)
     };
-    let grid = PathGrid::for_bound(BOUND_M).unwrap();
     let mut bench = Bench::engaged(config, None);
     let mut samples = Vec::new();
     for i in 0..1200 {
@@ -358,7 +374,7 @@ fn a_path_that_no_datagram_delivers_goes_by_the_stream_to_its_last_sample() {
         let made = bench.session.counters().knots as usize;
         assert_eq!(held, made / 257, "one tail a backlog, {made} knots");
     }
-    let end_before = by_stream(&bench.control, grid).frontier().unwrap();
+    let end_before = by_stream(&bench.control, BOUND_M).frontier().unwrap();
     assert!(bench.now.secs_since(end_before) < 257.0 * 0.033 + 0.1);
     bench.session.release();
     bench.drain();
@@ -368,12 +384,45 @@ fn a_path_that_no_datagram_delivers_goes_by_the_stream_to_its_last_sample() {
         Some(&release),
         "the path comes before"
     );
-    let path = by_stream(&bench.control, grid);
+    let path = by_stream(&bench.control, BOUND_M);
     for (t, x) in &samples {
         let tick = Stamp(tick_of(*t) * TICK_NS);
         let error_m = (path.eval(tick).expect("no hole, to the last").x - x).norm();
         assert!(error_m <= BOUND_M, "{error_m} m off");
     }
+}
+
+#[test]
+fn the_longest_knots_still_fit_a_datagram() {
+    let config = SessionConfig {
+        path_bound_m: Some(1e-6),
+        ..bound(0.05)
+    };
+    let mut bench = Bench::engaged(config, None);
+    let (mut longest, mut most) = (0, 0);
+    for i in 0..200 {
+        bench.forget();
+        // At rest, so that short codes are expected; then through the whole space, and lost for a while in between.
+        let far = f64::from(i * 7919 % 200) - 100.0;
+        let x = if i < 40 {
+            home()
+        } else {
+            Vector3::new(far, -far, far * 0.5)
+        };
+        if i % 7 == 0 {
+            bench.idle(600);
+        }
+        bench.sample(x);
+        for motion in bench.motions() {
+            most = most.max(motion.knots.count(MAX_KNOTS).unwrap());
+            longest = longest.max(OperatorDatagram::Motion(motion).encode().len());
+        }
+    }
+    assert_eq!(most, 24, "a message full of knots");
+    assert!(
+        longest <= MAX_DATAGRAM_LEN && longest > 500,
+        "{longest} bytes"
+    );
 }
 
 #[test]
@@ -391,8 +440,8 @@ fn what_was_acknowledged_is_not_sent_by_the_stream() {
         panic!("{:?}", bench.control)
     };
     assert_eq!(
-        (tail.first_knot, tail.knots.len()),
-        (made - 2, 3),
+        (tail.first_knot, tail.knots.count(MAX_TAIL_KNOTS)),
+        (made - 2, Ok(3)),
         "two and the last"
     );
     assert_eq!(bench.session.counters().knots, made + 1);

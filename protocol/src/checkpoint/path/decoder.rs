@@ -2,26 +2,29 @@
 
 use std::collections::VecDeque;
 
-use super::{DecodedKnot, MAX_SPAN_S, PathError, PathGrid, PathKnot, TICK_NS};
+use super::{CONTEXT, DecodedKnot, MAX_SPAN_S, PathError, PathGrid, PathKnot, TICK_NS};
 use crate::spline::{HermiteSpan, Jet};
 use crate::time::Stamp;
 
 /// The path up to the newest knot, the oldest knots forgotten beyond a fixed number.
 #[derive(Clone, Debug)]
-pub struct PathDecoder {
-    grid: PathGrid,
+pub struct PathDecoder<const D: usize = 3> {
+    grid: PathGrid<D>,
     capacity: usize,
-    knots: VecDeque<(DecodedKnot, bool)>,
+    knots: VecDeque<(DecodedKnot<D>, PathKnot<D>)>,
+    /// Also those that are forgotten.
+    appended: usize,
 }
 
-impl PathDecoder {
+impl<const D: usize> PathDecoder<D> {
     /// An empty path that remembers the newest `capacity` knots (at least two).
-    pub fn new(grid: PathGrid, capacity: usize) -> Self {
+    pub fn new(grid: PathGrid<D>, capacity: usize) -> Self {
         let capacity = capacity.max(2);
         Self {
             grid,
             capacity,
             knots: VecDeque::with_capacity(capacity),
+            appended: 0,
         }
     }
 
@@ -29,7 +32,7 @@ impl PathDecoder {
     ///
     /// # Errors
     /// [`PathError`]: out of range, not after the newest knot, or continuing what is not there.
-    pub fn append(&mut self, knot: &PathKnot) -> Result<(), PathError> {
+    pub fn append(&mut self, knot: &PathKnot<D>) -> Result<(), PathError> {
         let decoded = self.grid.dequantise(knot)?;
         let newest = self.knots.back().map(|(k, _)| k.t);
         let gap_ns = newest.map_or(0, |newest| decoded.t - newest);
@@ -50,16 +53,17 @@ impl PathDecoder {
         if self.knots.len() == self.capacity {
             self.knots.pop_front();
         }
-        self.knots.push_back((decoded, knot.start));
+        self.knots.push_back((decoded, *knot));
+        self.appended += 1;
         Ok(())
     }
 
     /// The motion at `t`; `None` before the oldest knot, after the newest, and in a hole.
-    pub fn eval(&self, t: Stamp) -> Option<Jet<3>> {
+    pub fn eval(&self, t: Stamp) -> Option<Jet<D>> {
         let after = self.knots.partition_point(|(k, _)| k.t <= t);
         let (a, _) = self.knots.get(after.checked_sub(1)?)?;
         match self.knots.get(after) {
-            Some((b, false)) => span(a, b)?.eval(t.secs_since(a.t)),
+            Some((b, knot)) if !knot.start => span(a, b)?.eval(t.secs_since(a.t)),
             _ if a.t == t => self.end_of_piece(after - 1),
             _ => None,
         }
@@ -71,29 +75,39 @@ impl PathDecoder {
     }
 
     /// The knots it remembers, oldest first.
-    pub fn knots(&self) -> impl ExactSizeIterator<Item = &DecodedKnot> {
+    pub fn knots(&self) -> impl ExactSizeIterator<Item = &DecodedKnot<D>> {
         self.knots.iter().map(|(k, _)| k)
     }
 
     /// As [`PathDecoder::knots`], with whether the path starts afresh there.
-    pub fn marked(&self) -> impl ExactSizeIterator<Item = (&DecodedKnot, bool)> {
-        self.knots.iter().map(|(k, start)| (k, *start))
+    pub fn marked(&self) -> impl ExactSizeIterator<Item = (&DecodedKnot<D>, bool)> {
+        self.knots.iter().map(|(k, knot)| (k, knot.start))
     }
 
-    fn end_of_piece(&self, index: usize) -> Option<Jet<3>> {
-        let (b, start) = self.knots.get(index)?;
+    /// The knots, at most [`CONTEXT`], before the newest `count`: what a block that begins with these is read
+    /// with. `None` where they are forgotten.
+    pub fn before(&self, count: usize) -> Option<Vec<PathKnot<D>>> {
+        let end = self.knots.len().checked_sub(count)?;
+        let from = end.saturating_sub(CONTEXT);
+        let whole = end - from == CONTEXT || self.appended == self.knots.len();
+        let knots = || self.knots.range(from..end).map(|(_, knot)| *knot);
+        whole.then(|| knots().collect())
+    }
+
+    fn end_of_piece(&self, index: usize) -> Option<Jet<D>> {
+        let (b, knot) = self.knots.get(index)?;
         let before = index.checked_sub(1).and_then(|i| self.knots.get(i));
         match before {
-            Some((a, _)) if !start => span(a, b)?.eval(b.t.secs_since(a.t)),
+            Some((a, _)) if !knot.start => span(a, b)?.eval(b.t.secs_since(a.t)),
             _ => Some(Jet {
                 x: b.x,
                 v: b.v,
-                a: nalgebra::Vector3::zeros(),
+                a: nalgebra::SVector::zeros(),
             }),
         }
     }
 }
 
-fn span(a: &DecodedKnot, b: &DecodedKnot) -> Option<HermiteSpan<3>> {
+fn span<const D: usize>(a: &DecodedKnot<D>, b: &DecodedKnot<D>) -> Option<HermiteSpan<D>> {
     HermiteSpan::new(b.t.secs_since(a.t), [a.x, a.v], [b.x, b.v])
 }

@@ -1,6 +1,6 @@
 //! Samples in, knots out, causally.
 
-use nalgebra::Vector3;
+use nalgebra::SVector;
 
 use super::{DecodedKnot, MAX_GAP_S, MAX_SPAN_S, PathError, PathGrid, PathKnot, TICK_NS, tick_of};
 use crate::checkpoint::CheckpointError;
@@ -17,24 +17,24 @@ const MAX_OPEN: usize = 1024;
 /// cannot be reached, the knot goes to the one before. A span of two neighbours has no sample between,
 /// so there is always a next knot and the bound holds by induction.
 #[derive(Clone, Debug)]
-pub struct PathEncoder {
-    grid: PathGrid,
+pub struct PathEncoder<const D: usize = 3> {
+    grid: PathGrid<D>,
     bound_m: f64,
     /// The knot the open span grows from, as decoded.
-    from: Option<DecodedKnot>,
+    from: Option<DecodedKnot<D>>,
     /// The samples after it (without it: the one sample a new piece will start at).
-    open: Vec<Sample>,
+    open: Vec<Sample<D>>,
     /// The knot that closes the span at the last open sample.
-    close: Option<PathKnot>,
+    close: Option<PathKnot<D>>,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Sample {
+struct Sample<const D: usize> {
     t: Stamp,
-    x: Vector3<f64>,
+    x: SVector<f64, D>,
 }
 
-impl PathEncoder {
+impl<const D: usize> PathEncoder<D> {
     /// An encoder that keeps the decoded path within `bound_m` of every sample.
     ///
     /// # Errors
@@ -50,7 +50,7 @@ impl PathEncoder {
     }
 
     /// The grid its knots lie on.
-    pub fn grid(&self) -> PathGrid {
+    pub fn grid(&self) -> PathGrid<D> {
         self.grid
     }
 
@@ -64,10 +64,10 @@ impl PathEncoder {
     ///
     /// # Errors
     /// [`PathError`]: the sample is dropped, the path goes on without it.
-    pub fn push(&mut self, t: Stamp, x: Vector3<f64>) -> Result<Option<PathKnot>, PathError> {
+    pub fn push(&mut self, t: Stamp, x: SVector<f64, D>) -> Result<Option<PathKnot<D>>, PathError> {
         let tick = tick_of(t);
         let t = Stamp(tick * TICK_NS);
-        self.grid.quantise(t, &x, &Vector3::zeros(), false)?;
+        self.grid.quantise(t, &x, &SVector::zeros(), None)?;
         let sample = Sample { t, x };
         let Some(newest) = self.newest() else {
             self.open.push(sample);
@@ -83,11 +83,11 @@ impl PathEncoder {
         let due = match (self.from, self.open.last().copied()) {
             (None, Some(first)) => {
                 let v = if hole {
-                    Vector3::zeros()
+                    SVector::zeros()
                 } else {
                     slope(first, sample)
                 };
-                Some(self.grid.quantise(first.t, &first.x, &v, true)?)
+                Some(self.grid.quantise(first.t, &first.x, &v, None)?)
             }
             (Some(from), Some(_)) if !hole => {
                 if let Some(close) = self.reach(&from, sample) {
@@ -105,11 +105,11 @@ impl PathEncoder {
 
     /// Closes the open span at the newest sample: the path is then complete up to it. The piece may go
     /// on with the next sample.
-    pub fn flush(&mut self) -> Option<PathKnot> {
+    pub fn flush(&mut self) -> Option<PathKnot<D>> {
         let due = match (self.from, self.open.last()) {
             (None, Some(first)) => {
-                let still = Vector3::zeros();
-                self.grid.quantise(first.t, &first.x, &still, true).ok()
+                let still = SVector::zeros();
+                self.grid.quantise(first.t, &first.x, &still, None).ok()
             }
             _ => self.close,
         }?;
@@ -129,9 +129,9 @@ impl PathEncoder {
     /// `sample` is the first after `due` (or, after a hole, the first of a new piece).
     fn restart(
         &mut self,
-        due: Option<PathKnot>,
+        due: Option<PathKnot<D>>,
         hole: bool,
-        sample: Sample,
+        sample: Sample<D>,
     ) -> Result<(), PathError> {
         if hole {
             self.from = None;
@@ -148,7 +148,7 @@ impl PathEncoder {
     }
 
     /// The knot at `end` that closes the span over all open samples, if there is one.
-    fn reach(&self, from: &DecodedKnot, end: Sample) -> Option<PathKnot> {
+    fn reach(&self, from: &DecodedKnot<D>, end: Sample<D>) -> Option<PathKnot<D>> {
         if self.open.len() >= MAX_OPEN || end.t.secs_since(from.t) > MAX_SPAN_S {
             return None;
         }
@@ -166,7 +166,7 @@ impl PathEncoder {
     }
 
     /// The knot at the last open sample, its tangent chosen with a view to the sample after it.
-    fn refined(&self, from: &DecodedKnot, after: Sample) -> Option<PathKnot> {
+    fn refined(&self, from: &DecodedKnot<D>, after: Sample<D>) -> Option<PathKnot<D>> {
         let (end, between) = self.open.split_last()?;
         let before = between.last().copied().unwrap_or(Sample {
             t: from.t,
@@ -181,20 +181,21 @@ impl PathEncoder {
     /// near to `wish` as that allows, on the way to the one that fits best by least squares.
     fn fit(
         &self,
-        from: &DecodedKnot,
-        between: &[Sample],
-        end: Sample,
-        wish: Vector3<f64>,
-    ) -> Option<PathKnot> {
+        from: &DecodedKnot<D>,
+        between: &[Sample<D>],
+        end: Sample<D>,
+        wish: SVector<f64, D>,
+    ) -> Option<PathKnot<D>> {
         let h = end.t.secs_since(from.t);
-        let still = Vector3::zeros();
-        let wished = self.grid.quantise(end.t, &end.x, &wish, false).ok()?;
+        let after = Some(tick_of(from.t));
+        let still = SVector::zeros();
+        let wished = self.grid.quantise(end.t, &end.x, &wish, after).ok()?;
         if self.holds(from, &wished, between) {
             return Some(wished);
         }
-        let knot = self.grid.quantise(end.t, &end.x, &still, false).ok()?;
+        let knot = self.grid.quantise(end.t, &end.x, &still, after).ok()?;
         let base = self.span(from, &knot)?;
-        let (mut num, mut den) = (Vector3::zeros(), 0.0);
+        let (mut num, mut den) = (SVector::zeros(), 0.0);
         for s in between {
             let t_s = s.t.secs_since(from.t);
             let u = t_s / h;
@@ -205,17 +206,17 @@ impl PathEncoder {
         let best = if den > 0.0 { num / den } else { wish };
         [0.25, 0.5, 0.75, 1.0].into_iter().find_map(|share| {
             let tangent = wish + (best - wish) * share;
-            let knot = self.grid.quantise(end.t, &end.x, &tangent, false).ok()?;
+            let knot = self.grid.quantise(end.t, &end.x, &tangent, after).ok()?;
             self.holds(from, &knot, between).then_some(knot)
         })
     }
 
-    fn span(&self, from: &DecodedKnot, knot: &PathKnot) -> Option<HermiteSpan<3>> {
+    fn span(&self, from: &DecodedKnot<D>, knot: &PathKnot<D>) -> Option<HermiteSpan<D>> {
         let to = self.grid.dequantise(knot).ok()?;
         HermiteSpan::new(to.t.secs_since(from.t), [from.x, from.v], [to.x, to.v])
     }
 
-    fn holds(&self, from: &DecodedKnot, knot: &PathKnot, between: &[Sample]) -> bool {
+    fn holds(&self, from: &DecodedKnot<D>, knot: &PathKnot<D>, between: &[Sample<D>]) -> bool {
         let limit = self.bound_m * self.bound_m * (1.0 - 1e-12);
         self.span(from, knot).is_some_and(|span| {
             // The newest first: they are the ones a stretched span misses.
@@ -227,11 +228,11 @@ impl PathEncoder {
     }
 }
 
-fn slope(a: Sample, b: Sample) -> Vector3<f64> {
+fn slope<const D: usize>(a: Sample<D>, b: Sample<D>) -> SVector<f64, D> {
     (b.x - a.x) / b.t.secs_since(a.t)
 }
 
-fn end_slope(a: Sample, b: Sample, c: Sample) -> Vector3<f64> {
+fn end_slope<const D: usize>(a: Sample<D>, b: Sample<D>, c: Sample<D>) -> SVector<f64, D> {
     let (before, last) = (slope(a, b), slope(b, c));
     let (h0, h1) = (b.t.secs_since(a.t), c.t.secs_since(b.t));
     last + (last - before) * (h1 / (h0 + h1))

@@ -3,18 +3,19 @@
 //! The curve is C¹, a [`HermiteSpan`](crate::spline::HermiteSpan) between any two knots: appended in
 //! O(1), its past immutable. Knots arrive complete and in order (the link's business); the promise is
 //! that at every sample up to the newest knot the decoded curve is within the bound of the hand, the
-//! samples' stamps taken to [`TICK_NS`].
+//! samples' stamps taken to [`TICK_NS`]. [`pack`] writes knots as bits.
 
 mod decoder;
 mod encoder;
+mod packed;
 
 pub use decoder::PathDecoder;
 pub use encoder::PathEncoder;
+pub use packed::{BlockError, CONTEXT, Origin, count, pack, unpack};
 
-use nalgebra::Vector3;
-use serde::{Deserialize, Serialize};
+use nalgebra::SVector;
 
-use super::{CheckpointError, Grid};
+use super::CheckpointError;
 use crate::time::Stamp;
 
 /// Knots lie on multiples of this many nanoseconds: 10 µs, 0.05 mm at 5 m/s.
@@ -29,28 +30,34 @@ pub const MAX_GAP_S: f64 = 0.5;
 /// Coordinates and tangents stay within ± this many steps, so that a difference of two fits an `i32`.
 const MAX_STEPS: i32 = 1 << 30;
 
+/// Tangents are in units of this many steps of their coordinate a second.
+const SLOPE_STEPS: i32 = 8;
+
+/// What [`PathGrid::slope_shift`] is at the start of a piece.
+const START_SHIFT: u32 = 1;
+
 /// A knot of the path, in integers of a [`PathGrid`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct PathKnot {
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PathKnot<const D: usize = 3> {
     /// When, in units of [`TICK_NS`] since the session's epoch.
     pub tick: i64,
-    /// Where, in steps of [`PathGrid::step_m`].
-    pub x: [i32; 3],
-    /// The tangent, in steps of [`PathGrid::slope_step_mps`].
-    pub v: [i32; 3],
+    /// Where, in steps of the grid.
+    pub x: [i32; D],
+    /// The tangent, in eight of these steps a second; a multiple of two to [`PathGrid::slope_shift`].
+    pub v: [i32; D],
     /// Nothing joins this knot to the one before it.
     pub start: bool,
 }
 
 /// A decoded knot.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct DecodedKnot {
+pub struct DecodedKnot<const D: usize = 3> {
     /// When.
     pub t: Stamp,
     /// Where, m.
-    pub x: Vector3<f64>,
+    pub x: SVector<f64, D>,
     /// The tangent, m/s.
-    pub v: Vector3<f64>,
+    pub v: SVector<f64, D>,
 }
 
 /// Why a sample or a knot was refused. The path is as it was before.
@@ -80,33 +87,52 @@ pub enum PathError {
 
 /// The steps of positions and tangents, derived from the bound by both ends.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PathGrid {
-    step_m: f64,
+pub struct PathGrid<const D: usize = 3> {
+    step: f64,
 }
 
-impl PathGrid {
-    /// The grid for `bound_m`: positions in steps of a quarter of the bound, tangents in steps of four
-    /// bounds a second (half a step moves a span of 0.25 s by at most 0.07 bounds).
+impl<const D: usize> PathGrid<D> {
+    /// The grid for `bound_m`: positions in steps of half the bound, tangents in units of four bounds a second.
     ///
     /// # Errors
     /// [`CheckpointError::Bound`], [`CheckpointError::BoundTooFine`].
     pub fn for_bound(bound_m: f64) -> Result<Self, CheckpointError> {
-        Ok(Self {
-            step_m: Grid::for_bound(bound_m)?.step_m(),
-        })
+        const LEAST_M: f64 = 2e-9;
+        let largest_m = f64::from(u32::MAX) * LEAST_M;
+        if !(bound_m > 0.0 && bound_m <= largest_m) {
+            return Err(CheckpointError::Bound { bound_m, largest_m });
+        }
+        // Whole nanometres; one part in 10⁹ of slack, so that 2 nm is 1 step and not 0.999….
+        match (bound_m / LEAST_M * (1.0 + 1e-9)) as u32 {
+            0 => Err(CheckpointError::BoundTooFine {
+                bound_m,
+                least_m: LEAST_M,
+            }),
+            nm => Ok(Self {
+                step: f64::from(nm) * 1e-9,
+            }),
+        }
     }
 
     /// Step of the positions, m.
     pub fn step_m(self) -> f64 {
-        self.step_m
+        self.step
     }
 
-    /// Step of the tangents, m/s.
+    /// Unit of the tangents, m/s.
     pub fn slope_step_mps(self) -> f64 {
-        self.step_m * 16.0
+        self.step * f64::from(SLOPE_STEPS)
     }
 
-    /// The integers nearest to a position and a tangent (m, m/s) at `t`.
+    /// At the end of a span of so many ticks, tangents are multiples of two to this: half of that moves no
+    /// coordinate of the span by more than 0.6 of a step, whatever its length.
+    pub fn slope_shift(span_ticks: i64) -> u32 {
+        // 10⁵ ticks are a second.
+        (1_000_000_000 / TICK_NS / span_ticks.max(1)).max(1).ilog2()
+    }
+
+    /// The integers nearest to a position and a tangent (m, m/s) at `t`, `after` the tick of the knot before (`None`: the
+    /// start of a piece).
     ///
     /// # Errors
     /// [`PathError::NonFinite`], [`PathError::OutOfRange`]. A tangent out of range is not an error but
@@ -114,23 +140,29 @@ impl PathGrid {
     pub fn quantise(
         self,
         t: Stamp,
-        x: &Vector3<f64>,
-        v: &Vector3<f64>,
-        start: bool,
-    ) -> Result<PathKnot, PathError> {
+        x: &SVector<f64, D>,
+        v: &SVector<f64, D>,
+        after: Option<i64>,
+    ) -> Result<PathKnot<D>, PathError> {
         if !x.iter().chain(v.iter()).all(|c| c.is_finite()) {
             return Err(PathError::NonFinite);
         }
+        let tick = tick_of(t);
+        let shift = after.map_or(START_SHIFT, |after| {
+            Self::slope_shift(tick.saturating_sub(after))
+        });
+        let multiple = f64::from(1_u32 << shift);
         let limit = f64::from(MAX_STEPS);
-        let (x, v) = (x / self.step_m, v / self.slope_step_mps());
+        let (x, v) = (x / self.step, v / (self.slope_step_mps() * multiple));
         if x.iter().any(|c| c.abs() > limit) {
             return Err(PathError::OutOfRange);
         }
+        let most = limit / multiple;
         Ok(PathKnot {
-            tick: tick_of(t),
+            tick,
             x: core::array::from_fn(|d| x[d].round() as i32),
-            v: core::array::from_fn(|d| v[d].clamp(-limit, limit).round() as i32),
-            start,
+            v: core::array::from_fn(|d| (v[d].clamp(-most, most).round() as i32) << shift),
+            start: after.is_none(),
         })
     }
 
@@ -138,15 +170,15 @@ impl PathGrid {
     ///
     /// # Errors
     /// [`PathError::OutOfRange`] for integers [`quantise`](Self::quantise) never makes.
-    pub fn dequantise(self, knot: &PathKnot) -> Result<DecodedKnot, PathError> {
+    pub fn dequantise(self, knot: &PathKnot<D>) -> Result<DecodedKnot<D>, PathError> {
         let range = -MAX_STEPS..=MAX_STEPS;
         let in_range = knot.x.iter().chain(&knot.v).all(|n| range.contains(n));
         let ns = knot.tick.checked_mul(TICK_NS);
         match ns {
             Some(ns) if in_range => Ok(DecodedKnot {
                 t: Stamp(ns),
-                x: Vector3::from(knot.x.map(f64::from)) * self.step_m,
-                v: Vector3::from(knot.v.map(f64::from)) * self.slope_step_mps(),
+                x: SVector::from(knot.x.map(f64::from)) * self.step,
+                v: SVector::from(knot.v.map(f64::from)) * self.slope_step_mps(),
             }),
             _ => Err(PathError::OutOfRange),
         }

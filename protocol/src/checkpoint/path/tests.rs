@@ -1,4 +1,5 @@
 use super::*;
+use nalgebra::Vector3;
 use proptest::prelude::*;
 
 /// Encodes, decodes every knot, and returns the decoder with the knots.
@@ -48,7 +49,7 @@ fn swing(rate_hz: f64, duration_s: f64) -> Vec<(Stamp, Vector3<f64>)> {
 
 #[test]
 fn a_smooth_swing_needs_few_knots() {
-    for (bound_m, most) in [(0.005, 35), (0.02, 28)] {
+    for (bound_m, most) in [(0.005, 46), (0.02, 36)] {
         let samples = swing(100.0, 10.0);
         let (decoder, knots) = run(bound_m, &samples);
         assert!(worst(&decoder, &samples) <= bound_m);
@@ -140,7 +141,7 @@ fn what_cannot_be_is_refused_and_the_path_goes_on() {
     };
     assert_eq!(d.append(&far), Err(PathError::OutOfRange));
     d.append(&knot(100_000, false)).unwrap();
-    assert!(PathEncoder::new(0.0).is_err());
+    assert!(PathEncoder::<3>::new(0.0).is_err());
 }
 
 /// The delay of the live path: a knot is due with the first sample it does not reach, and stands at the one before.
@@ -158,6 +159,63 @@ fn a_knot_is_one_sample_late_and_no_more() {
         }
         assert!(knots > 5, "{rate_hz} Hz");
     }
+}
+
+#[test]
+fn what_no_block_holds_is_not_packed_and_what_is_none_is_named() {
+    let origin = Origin {
+        tick: 100,
+        x: [0; 3],
+    };
+    let knot = |tick, v: i32, start| PathKnot {
+        tick,
+        x: [1; 3],
+        v: [v; 3],
+        start,
+    };
+    let packed = |knots: &[PathKnot]| pack(10_000, &origin, &[], knots);
+    assert_eq!(packed(&[]), Some(vec![]));
+    assert_eq!(packed(&[knot(0, 0, false)]), None, "nothing to join");
+    assert_eq!(packed(&[knot(101, 0, true)]), None, "after the origin");
+    assert_eq!(packed(&[knot(0, 1, true)]), None, "off the lattice");
+    let two = [knot(0, 0, true), knot(1_000, 64, false)];
+    assert_eq!(
+        packed(&[two[0], knot(1_000, 32, false)]),
+        None,
+        "off the lattice"
+    );
+    assert_eq!(packed(&[two[1], two[0]]), None, "backwards");
+    let far = knot(1 << 31, 0, false);
+    assert_eq!(packed(&[two[0], far]), None, "too far");
+
+    let bytes = packed(&two).unwrap();
+    let read = |bytes: &[u8], limit| unpack(10_000, &origin, &[], bytes, limit);
+    assert_eq!(read(&bytes, 2), Ok(two.to_vec()));
+    assert_eq!(read(&[], 2), Ok(vec![]));
+    let many = BlockError::TooMany { count: 2, limit: 1 };
+    assert_eq!(read(&bytes, 1), Err(many));
+    assert_eq!(
+        read(&bytes[..bytes.len() - 1], 2),
+        Err(BlockError::Truncated)
+    );
+    let longer = [&bytes[..], &[0]].concat();
+    assert_eq!(read(&longer, 2), Err(BlockError::Trailing));
+    // One knot: 1; its ticks, position and tangent: 0 less than the origin's.
+    let mut w = super::super::bits::BitWriter::default();
+    w.golomb(0, 0);
+    w.golomb(1 << 31, 12);
+    assert_eq!(
+        read(&w.finish(), 2),
+        Err(BlockError::OutOfRange { index: 0 })
+    );
+    // Half an interval early is the interval before, late.
+    let mut w = super::super::bits::BitWriter::default();
+    w.golomb(0, 0);
+    w.golomb(2, 2);
+    w.signed(-501, 0);
+    (0..3).for_each(|_| w.golomb(0, 5));
+    let found = unpack(10_000, &origin, &two[..1], &w.finish(), 2);
+    assert_eq!(found, Err(BlockError::NotCanonical { index: 0 }));
 }
 
 #[test]
@@ -211,9 +269,11 @@ proptest! {
     fn quantising_twice_changes_nothing(samples in signal(), bound_m in 1e-4..0.1f64) {
         let (_, knots) = run(bound_m, &samples);
         let grid = PathGrid::for_bound(bound_m).unwrap();
+        let mut before = None;
         for k in knots {
+            let after = before.replace(k.tick).filter(|_| !k.start);
             let d = grid.dequantise(&k).unwrap();
-            prop_assert_eq!(grid.quantise(d.t, &d.x, &d.v, k.start).unwrap(), k);
+            prop_assert_eq!(grid.quantise(d.t, &d.x, &d.v, after).unwrap(), k);
         }
     }
 
@@ -264,6 +324,53 @@ proptest! {
             let live = decoder.eval(on_tick(*stamp)).unwrap().x;
             let finished = curve.eval(t.clamp(start_s, end_s)).unwrap().x;
             prop_assert!((live - finished).norm() <= 2.0 * bound_m + 1e-9);
+        }
+    }
+
+    /// Any stretch of a path travels, given the knots before it; what arrives is what was sent, to the bit.
+    #[test]
+    fn knots_travel_in_blocks(
+        samples in signal(),
+        bound_m in 1e-4..0.1f64,
+        interval_us in prop_oneof![Just(33_333u32), 1..1_000_000u32],
+        cuts in prop::collection::vec(1usize..9, 1..8),
+    ) {
+        let (_, knots) = run(bound_m, &samples);
+        let origin = Origin { tick: knots[0].tick + 7, x: [3, -2, 1] };
+        let (mut from, mut found) = (0, Vec::new());
+        for length in cuts.iter().cycle() {
+            let to = (from + length).min(knots.len());
+            let bytes = pack(interval_us, &origin, &knots[..from], &knots[from..to]).unwrap();
+            prop_assert_eq!(count(&bytes, 9), Ok(to - from));
+            // No more than the context counts.
+            let before = &found[from.saturating_sub(CONTEXT)..];
+            let block = unpack(interval_us, &origin, before, &bytes, 9).unwrap();
+            prop_assert_eq!(pack(interval_us, &origin, before, &block).unwrap(), bytes);
+            found.extend(block);
+            from = to;
+            if from == knots.len() {
+                break;
+            }
+        }
+        prop_assert_eq!(found, knots);
+    }
+
+    /// Whatever arrives is refused, or is what a sender would have sent.
+    #[test]
+    fn any_bytes_are_knots_or_an_error(
+        bytes: Vec<u8>,
+        interval_us in 1..1_000_000u32,
+        samples in signal(),
+        known in 0usize..10,
+    ) {
+        let (_, knots) = run(0.01, &samples);
+        let before = &knots[..known.min(knots.len())];
+        let origin = Origin { tick: i64::MIN, x: [i32::MAX; 3] };
+        for origin in [origin, Origin { tick: 0, x: [0; 3] }] {
+            if let Ok(found) = unpack(interval_us, &origin, before, &bytes, 32) {
+                prop_assert!(found.len() <= 32);
+                prop_assert_eq!(pack(interval_us, &origin, before, &found).unwrap(), bytes.clone());
+            }
         }
     }
 }

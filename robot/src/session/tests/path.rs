@@ -24,11 +24,15 @@ impl Bench {
         let t = Stamp(last.tick * TICK_NS + MS);
         self.now = Mono(t.0 - OFFSET + 50 * MS);
         let state = WireState::quantise(&moving(t)).unwrap();
-        let grid = PathEncoder::new(0.02).unwrap().grid();
+        let code = PathCode {
+            grid: PathGrid::for_bound(0.02).unwrap(),
+            sample_us: 33_333,
+        };
+        let (before, due) = knots[..range.end].split_at(range.start);
         let motion = Motion {
             state,
             first_knot: range.start as u32,
-            knots: knots::pack(&state, grid, &knots[range]).unwrap(),
+            knots: KnotBlock::pack(&state, code, before, due).unwrap(),
             ..self.motion(seq, 0)
         };
         self.send(&motion);
@@ -55,7 +59,7 @@ fn repeated_knots_count_once_and_a_gap_waits() {
     assert_eq!(bench.frontier() as usize, knots.len());
     assert_eq!(bench.dropped(), 0);
 
-    let grid = PathEncoder::new(0.02).unwrap().grid();
+    let grid: PathGrid = PathGrid::for_bound(0.02).unwrap();
     let held = bench.session.mirror().unwrap().path().knots();
     let sent = knots.iter().map(|k| grid.dequantise(k).unwrap());
     assert!(held.copied().eq(sent), "every knot, in order, to the bit");
@@ -81,15 +85,19 @@ fn knots_that_cannot_be_leave_the_path_as_it_was() {
     let mut bench = Bench::mirroring(None);
     let knots = knots(&bench);
     bench.send_knots(1, &knots, 0..2);
-    let mut backwards = knots.clone();
-    backwards[2] = PathKnot {
-        tick: knots[1].tick,
-        ..knots[2]
-    };
-    bench.send_knots(2, &backwards, 2..3);
     let mut far = knots.clone();
-    far[2].x = [i32::MAX, 0, 0];
-    bench.send_knots(3, &far, 2..3);
+    // Further on than a span can be.
+    far[2].tick = far[1].tick + 100_001;
+    far[2].v = [0; 3];
+    bench.send_knots(2, &far, 2..3);
+    // Not the knots it says it holds.
+    let noise = Motion {
+        state: WireState::quantise(&moving(bench.stamp(0))).unwrap(),
+        first_knot: 2,
+        knots: KnotBlock(vec![0x80, 0, 0, 0]),
+        ..bench.motion(3, 0)
+    };
+    bench.send(&noise);
     assert_eq!(bench.frontier(), 2);
     bench.send_knots(4, &knots, 2..3);
     assert_eq!(bench.frontier(), 3);
