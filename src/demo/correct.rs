@@ -7,8 +7,9 @@ use nalgebra::{SVector, Vector3};
 use serde::Serialize;
 use telemime_operator::cli::{Event as Operator, PlayReport, Scores};
 use telemime_operator::demonstration::{Demonstration, Sample};
-use telemime_operator::session::LOST_S;
+use telemime_operator::session::{Bent, LOST_S};
 use telemime_protocol::skill::{Gmr, chi_squared_quantile};
+use telemime_protocol::time::Stamp;
 use telemime_sim::hand::{carry, push};
 
 use super::figures::{load_skill, save};
@@ -66,24 +67,6 @@ struct Correction {
     /// Least plan seconds per second meanwhile.
     slowest: f64,
 }
-
-/// What the robot was told, at the arm's time since the engage, s.
-struct Told {
-    at_s: f64,
-    plan_s: f64,
-    rate: f64,
-    share: f64,
-    offset: Vector3<f64>,
-}
-
-/// At the engage.
-const UNBENT: Told = Told {
-    at_s: 0.0,
-    plan_s: 0.0,
-    rate: 1.0,
-    share: 0.0,
-    offset: Vector3::new(0.0, 0.0, 0.0),
-};
 
 /// A performance to learn from.
 pub(super) fn demonstration(seed: u64, index: u32) -> Vec<Sample> {
@@ -153,14 +136,14 @@ pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Res
     let plan_at = |t_s: f64| plan(&played, at(&told, t_s).plan_s);
     let meant: Vec<_> = grid
         .iter()
-        .map(|&t_s| plan_at(t_s) + at(&told, t_s).offset)
+        .map(|&t_s| plan_at(t_s) + at(&told, t_s).offset_m)
         .collect();
     let followed: Vec<_> = grid.iter().map(|&t_s| played.tip.at(t_s)).collect();
     let mut corrections = Vec::new();
     for hold in &holds {
         let (first, last) = (&hold[0], &hold[hold.len() - 1]);
         let within = |t_s: f64| (first.t_s..=last.t_s + 0.1).contains(&t_s);
-        let meanwhile = || told.iter().filter(|told| within(told.at_s));
+        let meanwhile = || told.iter().filter(|told| within(told.at.as_secs_f64()));
         let Some(newest) = meanwhile().last() else {
             continue;
         };
@@ -199,25 +182,35 @@ pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Res
     deliver(args, table(&result), &result, &shown)
 }
 
-fn told(run: &Run, engaged_ns: i64) -> Vec<Told> {
+/// What the robot was told, at the arm's time since the engage; first of all to play the plan as it is.
+fn told(run: &Run, engaged_ns: i64) -> Vec<Bent> {
+    let unbent = Bent {
+        at: Stamp::ZERO,
+        plan_s: 0.0,
+        rate: 1.0,
+        hand_m: None,
+        offset_m: Vector3::zeros(),
+        share: 0.0,
+    };
     let told = run.operator.iter().filter_map(|e| match e {
         Operator::Bent {
             plan_s,
             rate,
             share,
+            hand_m,
             offset_m,
             mono_ns,
-            ..
-        } => Some(Told {
-            at_s: (mono_ns - engaged_ns) as f64 * 1e-9,
+        } => Some(Bent {
+            at: Stamp(mono_ns - engaged_ns),
             plan_s: *plan_s,
             rate: *rate,
+            hand_m: hand_m.map(Vector3::from),
+            offset_m: Vector3::from(*offset_m),
             share: *share,
-            offset: Vector3::from(*offset_m),
         }),
         _ => None,
     });
-    told.collect()
+    std::iter::once(unbent).chain(told).collect()
 }
 
 /// What the hand did, and when it did.
@@ -231,35 +224,8 @@ fn marks(run: &Run, engaged_ns: i64) -> Vec<(String, f64)> {
     marks.collect()
 }
 
-/// What was true at the arm at `t_s`: linear between what it was told; before anything, the plan as it is.
-fn at(told: &[Told], t_s: f64) -> Told {
-    let after = told.partition_point(|told| told.at_s <= t_s);
-    let Some(before) = after.checked_sub(1).map(|i| &told[i]) else {
-        return Told {
-            at_s: t_s,
-            plan_s: t_s,
-            ..UNBENT
-        };
-    };
-    let (plan_s, offset) = match told.get(after) {
-        Some(next) => {
-            let u = (t_s - before.at_s) / (next.at_s - before.at_s);
-            (
-                before.plan_s + (next.plan_s - before.plan_s) * u,
-                before.offset.lerp(&next.offset, u),
-            )
-        }
-        None => (
-            before.plan_s + before.rate * (t_s - before.at_s),
-            before.offset,
-        ),
-    };
-    Told {
-        at_s: t_s,
-        plan_s,
-        offset,
-        ..*before
-    }
+fn at(told: &[Bent], t_s: f64) -> Bent {
+    Bent::among(told, Stamp::from_secs_f64(t_s)).unwrap_or(told[0])
 }
 
 fn plan(played: &Played, plan_s: f64) -> Vector3<f64> {
@@ -272,7 +238,7 @@ fn figure(
     run: &Run,
     played: &Played,
     holds: &[&[Sample]],
-    told: &[Told],
+    told: &[Bent],
     marks: &[(String, f64)],
     grid: &[f64],
     result: &Result,
@@ -329,10 +295,11 @@ fn figure(
             layers,
         )
     };
-    let within = |t: &&Told| t.at_s <= grid.last().copied().unwrap_or_default();
-    let all = || std::iter::once(&UNBENT).chain(told.iter().filter(within));
-    let share = all().map(|t| (t.at_s, t.share));
-    let rate = all().map(|t| (t.at_s, t.rate));
+    let end_s = grid.last().copied().unwrap_or_default();
+    let all = || told.iter().map(|told| (told.at.as_secs_f64(), told));
+    let within = || all().filter(move |(t_s, _)| *t_s <= end_s);
+    let share = within().map(|(t_s, told)| (t_s, told.share));
+    let rate = within().map(|(t_s, told)| (t_s, told.rate));
     let ratios = over(
         "what the robot is told".into(),
         "share, rate".into(),

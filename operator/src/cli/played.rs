@@ -2,6 +2,7 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_protocol::checkpoint::PoseCurve;
+use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{RobotState, Telemetry};
 
 use super::report::{Event, Scores, TurnScores};
@@ -136,27 +137,12 @@ impl Played {
         })
     }
 
-    /// The plan's time (s) and where the hand belongs (m), `t_s` after the engage: linear between what the robot was told.
+    /// The plan's time (s) and where the hand belongs (m), `t_s` after the engage.
     fn meant_at(&self, t_s: f64) -> (f64, Vector3<f64>) {
         let engaged_us = self.engaged.as_ref().map_or(0, |engaged| engaged.t_us);
-        let at_s = |bent: &session::Bent| (bent.at.0 / 1000 - engaged_us) as f64 * 1e-6;
-        let after = self.bends.partition_point(|bent| at_s(bent) <= t_s);
-        let Some(before) = after.checked_sub(1).map(|i| &self.bends[i]) else {
-            return (t_s, self.curve.position_at(t_s));
-        };
-        let (plan_s, offset) = match self.bends.get(after) {
-            Some(next) => {
-                let u = (t_s - at_s(before)) / (at_s(next) - at_s(before));
-                (
-                    before.plan_s + (next.plan_s - before.plan_s) * u,
-                    before.offset_m.lerp(&next.offset_m, u),
-                )
-            }
-            None => (
-                before.plan_s + before.rate * (t_s - at_s(before)),
-                before.offset_m,
-            ),
-        };
+        let t = Stamp(engaged_us.saturating_mul(1000)).offset_by_secs(t_s);
+        let bent = session::Bent::among(&self.bends, t);
+        let (plan_s, offset) = bent.map_or((t_s, Vector3::zeros()), |b| (b.plan_s, b.offset_m));
         (plan_s, self.curve.position_at(plan_s) + offset)
     }
 

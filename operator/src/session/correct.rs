@@ -72,6 +72,30 @@ pub struct Bent {
     pub share: f64,
 }
 
+impl Bent {
+    /// What is true at the arm at `t`, of all it was told in order of time: linear between two, the newest at its rate
+    /// after all; `None` before any.
+    pub fn among(told: &[Self], t: Stamp) -> Option<Self> {
+        let after = told.partition_point(|bent| bent.at <= t);
+        let before = told[after.checked_sub(1)?];
+        let since_s = t.secs_since(before.at);
+        let (plan_s, offset_m) = match told.get(after) {
+            Some(next) => {
+                let u = since_s / next.at.secs_since(before.at);
+                let plan_s = before.plan_s + (next.plan_s - before.plan_s) * u;
+                (plan_s, before.offset_m.lerp(&next.offset_m, u))
+            }
+            None => (before.plan_s + before.rate * since_s, before.offset_m),
+        };
+        Some(Self {
+            at: t,
+            plan_s,
+            offset_m,
+            ..before
+        })
+    }
+}
+
 /// A hand that holds on.
 struct Hold {
     since: Stamp,

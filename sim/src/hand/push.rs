@@ -18,13 +18,7 @@ const FROM_M: [f64; 3] = [0.15, -0.1, 2.2];
 /// let moved = push[push.len() - 1].1[1] - push[0].1[1];
 /// assert!((moved - 0.08).abs() < 0.02);
 /// ```
-pub fn push(
-    seed: u64,
-    at_s: f64,
-    way: [f64; 3],
-    rise_s: f64,
-    hold_s: f64,
-) -> Vec<(f64, [f64; 3])> {
+pub fn push(seed: u64, at_s: f64, way: [f64; 3], rise_s: f64, hold_s: f64) -> Vec<(f64, [f64; 3])> {
     let mut rng = stream(seed ^ PUSH_STREAM, at_s.to_bits());
     let frames = ((rise_s + hold_s) / FRAME_S).round() as u32;
     (0..=frames)
