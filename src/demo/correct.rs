@@ -26,7 +26,7 @@ const GOAL_M: [f64; 3] = [0.35, -0.1, 2.0];
 const CARRY_S: f64 = 5.0;
 
 /// How far the hand pushes aside, and how far against the motion, m.
-const ASIDE_M: f64 = 0.08;
+const ASIDE_M: f64 = 0.06;
 const AGAINST_M: f64 = 0.3;
 
 /// How long it takes to push aside, and how long it stays there, s.
@@ -84,12 +84,11 @@ pub(super) fn hand(args: &Args, material: &Material) -> anyhow::Result<PathBuf> 
         let x = |t_s| recording.position_at(t_s);
         (x(t_s + 0.1) - x(t_s - 0.1)) / 0.2
     };
-    // To the side: along the axis that the motion goes along least while it is pushed.
-    let aside = |t_s: f64| {
-        let way = recording.position_at(t_s + RISE_S + HOLD_S) - recording.position_at(t_s);
-        let mut aside = [0.0; 3];
-        aside[way.map(f64::abs).imin()] = ASIDE_M;
-        aside
+    // To the side: at right angles to where the motion leads while it is pushed, first and then.
+    let aside = |t_s: f64| -> [f64; 3] {
+        let [a, b, c] = [0.0, 0.5, 1.0].map(|u| recording.position_at(t_s + u * (RISE_S + HOLD_S)));
+        let side = (b - a).cross(&(c - b)).try_normalize(1e-9);
+        (side.unwrap_or_else(Vector3::y) * ASIDE_M).into()
     };
     let against = |t_s: f64| -> [f64; 3] {
         let direction = velocity(t_s).try_normalize(1e-6);
