@@ -2,9 +2,10 @@
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
-use nalgebra::Vector3;
+use nalgebra::{SVector, Vector3};
 use telemime_protocol::checkpoint::path::{PathDecoder, PathEncoder};
-use telemime_protocol::checkpoint::select::{Effort, bounded_with};
+use telemime_protocol::checkpoint::select::{Effort, bounded_with, counted_with};
+use telemime_protocol::pose::exp;
 use telemime_protocol::time::Stamp;
 
 fn main() {
@@ -26,10 +27,17 @@ fn swing(rate_hz: f64, samples: u32) -> (Vec<f64>, Vec<Vector3<f64>>) {
 }
 
 /// 300 samples in three dimensions.
-#[divan::bench(args = [Effort::Quick, Effort::Thorough])]
+#[divan::bench(args = [Effort::Quick, Effort::Brisk, Effort::Thorough])]
 fn selection(bencher: Bencher, effort: Effort) {
     let (t, x) = swing(30.0, 300);
     bencher.bench(|| bounded_with(&t, &x, black_box(0.002), effort));
+}
+
+/// 46 of 300 samples in three dimensions.
+#[divan::bench(args = [Effort::Brisk, Effort::Thorough])]
+fn selection_of_a_number(bencher: Bencher, effort: Effort) {
+    let (t, x) = swing(30.0, 300);
+    bencher.bench(|| counted_with(&t, &x, black_box(46), effort));
 }
 
 /// A second of samples at 1 kHz, a sample an item.
@@ -47,6 +55,51 @@ fn live_encoding(bencher: Bencher, bound_m: f64) {
         .bench_values(|mut encoder| {
             for (t, x) in &samples {
                 black_box(encoder.push(*t, *x).expect("a sample"));
+            }
+        });
+}
+
+/// The same of a place and an orientation in ℝ⁴.
+#[divan::bench(args = [0.0005, 0.002, 0.01])]
+fn live_encoding_of_poses(bencher: Bencher, bound_m: f64) {
+    let samples = turning();
+    bencher
+        .counter(ItemsCount::new(samples.len()))
+        .with_inputs(|| PathEncoder::with_bounds(3, [bound_m, 0.01]).expect("bounds"))
+        .bench_values(|mut encoder| {
+            for (t, x) in &samples {
+                black_box(encoder.push(*t, *x).expect("a sample"));
+            }
+        });
+}
+
+/// A second at 1 kHz.
+fn turning() -> Vec<(Stamp, SVector<f64, 7>)> {
+    let (t, x) = swing(1000.0, 1000);
+    let pose = |(t, x): (&f64, &Vector3<f64>)| {
+        let q = exp(&(Vector3::new(1.0, 0.2, libm::sin(*t)) * (1.5 * t)));
+        let all = x.iter().chain(q.coords.iter()).copied();
+        (Stamp::from_secs_f64(*t), SVector::from_iterator(all))
+    };
+    t.iter().zip(&x).map(pose).collect()
+}
+
+/// A knot of a pose appended, and the path read at its frontier.
+#[divan::bench]
+fn live_decoding_of_poses(bencher: Bencher) {
+    let mut encoder = PathEncoder::with_bounds(3, [0.002, 0.01]).expect("bounds");
+    let pushed = turning()
+        .into_iter()
+        .filter_map(|(t, x)| encoder.push(t, x).expect("a sample"));
+    let knots: Vec<_> = pushed.collect();
+    let grid = encoder.grid();
+    bencher
+        .counter(ItemsCount::new(knots.len()))
+        .with_inputs(|| PathDecoder::new(grid, 64))
+        .bench_values(|mut decoder| {
+            for knot in &knots {
+                decoder.append(knot).expect("a knot that fits");
+                black_box(decoder.eval(decoder.frontier().expect("a knot")));
             }
         });
 }

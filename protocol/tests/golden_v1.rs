@@ -16,8 +16,8 @@ const STATE: WireState = WireState {
 
 const PARAMS: WireParams = WireParams {
     gain: 255,
-    trust: 200,
-    cv_damping: 128,
+    inflation: 144,
+    weights: [[200, 30, 20], [150, 60, 40], [100, 80, 30]],
 };
 
 const POSE: WirePose = WirePose {
@@ -88,13 +88,13 @@ fn operator_control() {
         ),
         (
             engage(mirror(WirePose::default())),
-            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ffc8800000 \
+            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ff90c81e14963c2864501e0000 \
              0000003e0000003f000000bf0000003f0000003ffb204efb3582fb8a02",
         ),
         (
             engage(mirror(POSE)),
-            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ffc880 \
-             01fb204efb6ff50004010203fffefd7f8000050607ffc8800164 \
+            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ff90c81e14963c2864501e \
+             01fb204efb6ff50004010203fffefd7f8000050607ff90c81e14963c2864501e0164 \
              0000003e0000003f000000bf0000003f0000003ffb204efb3582fb8a02",
         ),
         (
@@ -215,18 +215,18 @@ fn operator_datagrams() {
     pinned(vec![
         (
             motion(Some(0xdead_beef), WirePose::default(), knots),
-            "000103fc70110100fb8a02fb1032ffc88001fcefbeaddefc0ead2500fbd007fb8713fb50c30301ff \
+            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e01fcefbeaddefc0ead2500fbd007fb8713fb50c30301ff \
              02fe03fd28ce3c7f80000000fa045a00c3fe",
         ),
         (
             motion(None, WirePose::default(), KnotBlock::default()),
-            "000103fc70110100fb8a02fb1032ffc88000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
+            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
              ce3c7f80000000fa00",
         ),
         (
             motion(None, POSE, KnotBlock::default()),
-            "000103fc70110100fb8a02fb1032ffc88000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
-             ce3c7f800001fb204efb6ff50004010203fffefd7f8000050607ffc8800164fa00",
+            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
+             ce3c7f800001fb204efb6ff50004010203fffefd7f8000050607ff90c81e14963c2864501e0164fa00",
         ),
         (go(None), "010103fbfb00fc0ead2500fb8a0200"),
         (
@@ -246,7 +246,7 @@ fn operator_datagrams() {
                 held: Some(WireHeld {
                     state: STATE,
                     gain: 255,
-                    damping: 128,
+                    straight: 128,
                     weight: [127, -64, 0, 64, 1, 100],
                 }),
             })),

@@ -43,10 +43,11 @@ fn state() -> impl Strategy<Value = WireState> {
 }
 
 fn params() -> impl Strategy<Value = WireParams> {
-    any::<[u8; 3]>().prop_map(|[gain, trust, cv_damping]| WireParams {
+    let weights = prop::array::uniform3(prop::array::uniform3(0..=85_u8));
+    (any::<u8>(), any::<u8>(), weights).prop_map(|(gain, inflation, weights)| WireParams {
         gain,
-        trust,
-        cv_damping,
+        inflation,
+        weights,
     })
 }
 
@@ -339,10 +340,10 @@ fn bend() -> impl Strategy<Value = WireBend> {
     )
         .prop_map(|([xx, yy, zz], [yx, zx, zy])| [xx, yx, yy, zx, zy, zz]);
     let held =
-        (state(), any::<[u8; 2]>(), weight).prop_map(|(state, [gain, damping], weight)| WireHeld {
+        (state(), any::<[u8; 2]>(), weight).prop_map(|(state, [gain, straight], weight)| WireHeld {
             state,
             gain,
-            damping,
+            straight,
             weight,
         });
     let place = || -1_000_000..=1_000_000i32;
@@ -583,15 +584,61 @@ proptest! {
     }
 
     #[test]
-    fn parameters_travel_within_half_a_step(v in prop::array::uniform3(0.0..=1.0f64)) {
-        let sent = Params { gain: v[0], trust: v[1], cv_damping: v[2] };
+    fn parameters_travel_to_the_nearest_step(
+        gain in 0.0..=1.0f64,
+        octaves in -16.0..=15.8f64,
+        shares in prop::array::uniform3(prop::array::uniform4(1e-3..=1.0f64)),
+    ) {
+        let weights = shares.map(|[a, b, c, d]| [a, b, c].map(|v| v / (a + b + c + d)));
+        let sent = Params { gain, inflation: octaves.exp2(), weights };
+        prop_assert!(sent.checked().is_ok());
         let wire = WireParams::quantise(&sent);
         let back = wire.dequantise();
         prop_assert!(back.checked().is_ok());
-        for (a, b) in [(sent.gain, back.gain), (sent.trust, back.trust), (sent.cv_damping, back.cv_damping)] {
-            prop_assert!((a - b).abs() <= 0.5 / 255.0 + 1e-12);
+        prop_assert!((sent.gain - back.gain).abs() <= 0.5 / 255.0 + 1e-12);
+        prop_assert!((sent.inflation / back.inflation).log2().abs() <= 1.0 / 16.0 + 1e-9);
+        for (a, b) in sent.weights.iter().flatten().zip(back.weights.iter().flatten()) {
+            // Where three are rounded up, the largest gives way.
+            prop_assert!((a - b).abs() <= 1.5 / 255.0 + 1e-12);
         }
         prop_assert_eq!(WireParams::quantise(&back), wire);
+    }
+}
+
+#[test]
+fn weights_of_more_than_all_are_refused() {
+    let heavy = |weights| {
+        let state = HandState::first(Stamp(0), Vector3::zeros());
+        OperatorDatagram::Motion(Motion {
+            epoch: 1,
+            engagement: 1,
+            seq: 1,
+            lease_ms: 1,
+            model: 0,
+            params: WireParams {
+                weights,
+                ..WireParams::quantise(&Params::DEFAULT)
+            },
+            checksum: None,
+            state: WireState::quantise(&state).expect("within range"),
+            pose: WirePose::default(),
+            first_knot: 0,
+            knots: KnotBlock::default(),
+        })
+        .encode()
+    };
+    let all = [[0, 0, 255], [85, 85, 85], [255, 0, 0]];
+    assert!(OperatorDatagram::decode(&heavy(all)).is_ok());
+    for band in 0..3 {
+        let mut more = all;
+        more[band][1] += 1;
+        assert!(matches!(
+            OperatorDatagram::decode(&heavy(more)),
+            Err(DecodeError::Invalid {
+                field: "motion.params",
+                ..
+            })
+        ));
     }
 }
 

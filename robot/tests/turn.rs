@@ -132,11 +132,7 @@ fn turning(q: UnitQuaternion<f64>, omega: Vector3<f64>) -> TurnForecast {
         memory: MEMORY_TAU_S.map(|tau_s| pose::moved(&q, &(own * -tau_s))),
         ..TurnState::first(Stamp::ZERO, q)
     };
-    let undamped = Params {
-        cv_damping: 1.0,
-        ..Params::DEFAULT
-    };
-    TurnForecast::constant_velocity(&state, &undamped)
+    TurnForecast::constant_velocity(&state, &Params::only([0.0, 0.0, 1.0]))
 }
 
 fn still() -> Forecast {

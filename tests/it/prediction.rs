@@ -10,7 +10,9 @@ use nalgebra::{SMatrix, Vector3};
 use telemime_operator::demonstration::Demonstration;
 use telemime_operator::learn::PredictorOptions;
 use telemime_operator::learn::predictor::{states, train, train_from_labels};
-use telemime_protocol::predict::{Forecast, KNOT_SPACING_S, Model, Params};
+use telemime_operator::session::adapt::Adaptation;
+use telemime_protocol::predict::{Forecast, KNOT_SPACING_S, Model};
+use telemime_protocol::wire::v1::WireParams;
 
 fn array<const N: usize>(v: &serde_json::Value) -> [f64; N] {
     let v = v.as_array().unwrap();
@@ -147,6 +149,7 @@ fn rounded(model: &Model) -> Model {
         model.knots(),
         standardisation,
         components,
+        *model.generic(),
         *model.calibration(),
     )
     .unwrap()
@@ -198,36 +201,45 @@ fn evaluate(groups: &[Vec<Demonstration>], most: usize) -> Scores {
                 continue;
             }
             let model = train(&others, &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
-            score(&model, test, &mut scores);
+            score(&model, reach_m(&others), test, &mut scores);
         }
     }
     scores
 }
 
-fn score(model: &Model, test: &Demonstration, scores: &mut Scores) {
+/// The diagonal of the box around them, m.
+fn reach_m(demos: &[Demonstration]) -> f64 {
+    let all = || demos.iter().flat_map(|d| d.samples()).map(|s| s.position);
+    let first = demos[0].samples()[0].position;
+    let (least, most) = all().fold((first, first), |(a, b), x| (a.inf(&x), b.sup(&x)));
+    (most - least).norm()
+}
+
+/// Scores every expert, and what the session would have sent.
+fn score(model: &Model, reach_m: f64, test: &Demonstration, scores: &mut Scores) {
     let end_s = test.last().t_s + 1e-9;
-    let undamped = Params {
-        cv_damping: 1.0,
-        ..Params::default()
-    };
+    let mut adaptation = Adaptation::of_places(1.0, Some(model.calibration()), reach_m);
+    let mut previous = None;
     for (sample, state) in test.samples().iter().zip(states(test)) {
+        if let Some(previous) = previous.replace(state) {
+            adaptation.observe(&previous, &state, Some(model));
+        }
+        let experts = Forecast::experts(&state, Some(model));
+        let sent = WireParams::quantise(&adaptation.params(&state)).dequantise();
+        let fused = Forecast::fused(&state, &experts, &sent);
         let mixture = model.posterior(&state);
-        let own = model.forecast(&state, &model.calibration().params);
-        let blend = model.forecast(&state, &Params::default());
-        let cv = Forecast::constant_velocity(&state, &undamped);
-        let damped = Forecast::constant_velocity(&state, &Params::default());
         for j in 1..=model.knots() {
             let h_s = j as f64 * KNOT_SPACING_S;
             if sample.t_s + h_s > end_s {
                 break;
             }
             let truth = test.position_at(sample.t_s + h_s) - sample.position;
+            let [_, generic, straight] = experts.displacement[j - 1];
             scores.add("hold", j, truth);
             scores.add("gmr", j, mixture.displacement[j - 1] - truth);
-            scores.add("blend", j, blend.ahead.knots[j].displacement - truth);
-            scores.add("cv", j, cv.ahead.knots[j].displacement - truth);
-            scores.add("damped cv", j, damped.ahead.knots[j].displacement - truth);
-            scores.add("own params", j, own.ahead.knots[j].displacement - truth);
+            scores.add("generic", j, generic - truth);
+            scores.add("straight", j, straight - truth);
+            scores.add("fused", j, fused.ahead.knots[j].displacement - truth);
         }
     }
 }

@@ -10,8 +10,8 @@ use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid, PathKnot};
 use telemime_protocol::checkpoint::{Checkpoint, Grid, Plan, PosePlan};
 use telemime_protocol::pose;
 use telemime_protocol::predict::{
-    BLOCK, Calibration, FEATURES, Forecast, MAX_KNOTS, Model, Regression, Standardisation, TARGETS,
-    TurnForecast, checksum,
+    BLOCK, Calibration, FEATURES, Forecast, Generic, MAX_KNOTS, Model, Regression, Standardisation,
+    TARGETS, TurnForecast, checksum,
 };
 use telemime_protocol::skill::{Gmm, Pace, Parts, Provenance, Samples, Skill, Source, Stats};
 use telemime_protocol::time::Stamp;
@@ -39,8 +39,8 @@ const STATE: WireState = WireState {
 
 const PARAMS: WireParams = WireParams {
     gain: 255,
-    trust: 230,
-    cv_damping: 128,
+    inflation: 136,
+    weights: [[230, 10, 10], [180, 40, 30], [128, 60, 50]],
 };
 
 const TURN: WireTurn = WireTurn {
@@ -49,8 +49,8 @@ const TURN: WireTurn = WireTurn {
     memory: [[20, -10, 0], [40, -20, 3], [70, -30, 5], [90, -40, 8]],
     params: WireParams {
         gain: 255,
-        trust: 255,
-        cv_damping: 128,
+        inflation: 128,
+        weights: [[0, 0, 200]; 3],
     },
 };
 
@@ -66,7 +66,7 @@ const BEND: WireBend = WireBend {
             memory: [[0, 40, -1], [0, 90, -2], [1, 120, -4], [1, 125, -4]],
         },
         gain: 255,
-        damping: 128,
+        straight: 128,
         weight: [64, 10, 100, 0, -5, 127],
     }),
 };
@@ -156,8 +156,16 @@ fn skill() -> Skill {
     const { assert!(BLOCK == 6) };
     let mut calibration = Calibration::UNTRIED;
     calibration.covariance = [2.0; MAX_KNOTS];
-    calibration.straight_m2 = [0.25; MAX_KNOTS];
+    calibration.errors = [[0.03125, 0.0625, 0.25, 0.5]; MAX_KNOTS];
     calibration.novelty90 = 16.0;
+    let mut generic = Generic {
+        lead: [[0.0; MAX_KNOTS]; 4],
+        products: [0.25; 10],
+    };
+    for knot in 0..3 {
+        generic.lead[0][knot] = 0.5 * (knot + 1) as f64;
+        generic.lead[2][knot] = 0.125 * (knot + 1) as f64;
+    }
     let model = Model::new(
         3,
         Standardisation {
@@ -168,6 +176,7 @@ fn skill() -> Skill {
             component(0.75, 0.0, 0.125, 0.25),
             component(0.25, 1.0, -0.0625, 0.5),
         ],
+        generic,
         calibration,
     )
     .unwrap();
@@ -458,14 +467,26 @@ fn values() -> BTreeMap<String, String> {
     say("skill tag", model_tag(&skill.id().0).to_string());
     say("novelty", format!("{:.9}", posterior.novelty));
     say("mixture(3)", vector(&posterior.displacement[2]));
-    say("weight", format!("{:.9}", forecast.ahead.weight));
-    say("blend(0.1)", vector(&forecast.at(0.1).position));
+    say("familiarity", format!("{:.9}", forecast.ahead.familiarity));
+    let experts = Forecast::experts(&state, Some(skill.predictor()));
+    say("generic(3)", vector(&experts.displacement[2][1]));
+    say("straight(3)", vector(&experts.displacement[2][2]));
+    say("fused(0.1)", vector(&forecast.at(0.1).position));
+    let covariance = forecast.ahead.knots[3].covariance;
     say(
-        "blend sigma(0.1)",
+        "fused V(3) diagonal",
+        vector(&Vector3::new(covariance[0], covariance[3], covariance[5])),
+    );
+    say(
+        "fused V(3) xy xz yz",
+        vector(&Vector3::new(covariance[1], covariance[2], covariance[4])),
+    );
+    say(
+        "fused sigma(0.1)",
         format!("{:.9}", forecast.at(0.1).sigma_m),
     );
     say(
-        "blend checksum",
+        "fused checksum",
         format!("{:08x}", checksum(&forecast, None)),
     );
 

@@ -3,8 +3,8 @@
 
 use std::marker::PhantomData;
 
-use nalgebra::{Matrix3, Vector3};
-use telemime_protocol::predict::{Calibration, KNOT_SPACING_S, MAX_KNOTS, Params};
+use nalgebra::Matrix3;
+use telemime_protocol::predict::{Calibration, KNOT_SPACING_S, MAX_KNOTS};
 
 use super::predictor::Course;
 use super::stats::quantile;
@@ -17,30 +17,28 @@ pub(crate) const CHI2_3_90: f64 = 6.251;
 const LEAST_M2: f64 = 1e-8;
 const LEAST_NOVELTY: f64 = 1.0;
 
-/// Knots (from 1) by whose errors the parameters are chosen: 100 to 300 ms, where predictions are used.
-const CHOSEN_BY: std::ops::RangeInclusive<usize> = 3..=9;
+/// Experts in the order of [`Calibration::errors`].
+const MIXTURE: usize = 0;
+const GENERIC: usize = 1;
+const STRAIGHT: usize = 2;
+const HOLD: usize = 3;
 
-/// A scalar least-squares problem `min Σ|b − s·a|²`.
+/// Squared errors of one expert.
 #[derive(Clone, Copy, Default)]
-struct Slope {
-    ab: f64,
-    aa: f64,
+struct Errors {
+    squared: f64,
+    count: u32,
 }
 
-impl Slope {
-    fn add(&mut self, a: &Vector3<f64>, b: &Vector3<f64>, weight: f64) {
-        self.ab += weight * a.dot(b);
-        self.aa += weight * a.norm_squared();
+impl Errors {
+    fn add(&mut self, squared: f64) {
+        self.squared += squared;
+        self.count += 1;
     }
 
-    /// The best s in [0, 1]; `otherwise` if there is nothing to go by.
-    fn solve(&self, otherwise: f64) -> f64 {
-        let s = self.ab / self.aa;
-        if s.is_finite() {
-            s.clamp(0.0, 1.0)
-        } else {
-            otherwise
-        }
+    /// Along one axis.
+    fn mean(&self) -> Option<f64> {
+        (self.count > 0).then(|| (self.squared / (3.0 * f64::from(self.count))).max(LEAST_M2))
     }
 }
 
@@ -48,48 +46,30 @@ impl Slope {
 pub(super) struct Trial<C> {
     course: PhantomData<C>,
     knots: usize,
-    damping: f64,
-    straight_m2: [f64; MAX_KNOTS],
-    /// Σ|truth|² at each knot, by which errors at different horizons are made comparable.
-    moved_m2: [f64; MAX_KNOTS],
-    trust: Slope,
+    errors: [[Errors; 4]; MAX_KNOTS],
     nees: Vec<Vec<f64>>,
     novelties: Vec<f64>,
 }
 
 impl<C: Course> Trial<C> {
-    /// Tries constant velocity, which needs no training and so nothing held out.
+    /// Tries the straight line and holding, which need no training and so nothing held out.
     pub(super) fn straight(demonstrations: &[Demonstration], knots: usize) -> Self {
-        let mut moved_m2 = [0.0; MAX_KNOTS];
-        visit::<C>(demonstrations, knots, |j, _, truth| {
-            moved_m2[j - 1] += truth.norm_squared();
-        });
-        let mut damping = Slope::default();
-        visit::<C>(demonstrations, knots, |j, straight, truth| {
-            if CHOSEN_BY.contains(&j) {
-                damping.add(straight, truth, share(&moved_m2, j));
-            }
-        });
-        let damping = damping.solve(Params::DEFAULT.cv_damping);
-        let mut squared = [0.0; MAX_KNOTS];
-        let mut count = [0_u32; MAX_KNOTS];
-        visit::<C>(demonstrations, knots, |j, straight, truth| {
-            squared[j - 1] += (straight * damping - truth).norm_squared();
-            count[j - 1] += 1;
-        });
-        let mut straight_m2 = Calibration::UNTRIED.straight_m2;
-        for ((v, sum), count) in straight_m2.iter_mut().zip(squared).zip(count) {
-            if count > 0 {
-                *v = (sum / (3.0 * f64::from(count))).max(LEAST_M2);
+        let mut errors = [[Errors::default(); 4]; MAX_KNOTS];
+        for d in demonstrations {
+            for (i, state) in C::states(d).iter().enumerate() {
+                let experts = C::experts(None, state);
+                for j in within(d, i, knots) {
+                    let truth = C::displacement(d, i, j);
+                    let straight = experts.displacement[j - 1][STRAIGHT];
+                    errors[j - 1][STRAIGHT].add((straight - truth).norm_squared());
+                    errors[j - 1][HOLD].add(truth.norm_squared());
+                }
             }
         }
         Self {
             course: PhantomData,
             knots,
-            damping,
-            straight_m2,
-            moved_m2,
-            trust: Slope::default(),
+            errors,
             nees: vec![Vec::new(); knots],
             novelties: Vec::new(),
         }
@@ -97,28 +77,20 @@ impl<C: Course> Trial<C> {
 
     /// Tries a model on a demonstration it was not trained on.
     pub(super) fn hold_out(&mut self, model: &C::Model, d: &Demonstration) {
-        let end_s = d.last().t_s + 1e-9;
         for (i, state) in C::states(d).iter().enumerate() {
             let p = C::posterior(model, state);
             self.novelties.push(p.novelty);
-            let velocity = C::velocity(state) * self.damping;
-            for j in 1..=self.knots {
-                let h_s = j as f64 * KNOT_SPACING_S;
-                if d.samples()[i].t_s + h_s > end_s {
-                    break;
-                }
+            let experts = C::experts(Some(model), state);
+            for j in within(d, i, self.knots) {
                 let truth = C::displacement(d, i, j);
                 let e = p.displacement[j - 1] - truth;
+                let generic = experts.displacement[j - 1][GENERIC];
+                self.errors[j - 1][MIXTURE].add(e.norm_squared());
+                self.errors[j - 1][GENERIC].add((generic - truth).norm_squared());
                 // A planar motion has no variance across its plane.
                 let covariance = p.covariance[j - 1] + Matrix3::identity() * LEAST_M2;
                 if let Some(c) = covariance.cholesky() {
                     self.nees[j - 1].push(e.dot(&c.solve(&e)));
-                }
-                if CHOSEN_BY.contains(&j) {
-                    let straight = velocity * h_s;
-                    let apart = p.displacement[j - 1] - straight;
-                    let weight = share(&self.moved_m2, j);
-                    self.trust.add(&apart, &(truth - straight), weight);
                 }
             }
         }
@@ -130,12 +102,11 @@ impl<C: Course> Trial<C> {
         beyond as f64 / self.novelties.len().max(1) as f64
     }
 
-    /// `c_h = q₉₀(NEES)/6.251`; trust and damping by least squares.
+    /// `c_h = q₉₀(NEES)/6.251`, and the mean squared errors; where nothing was held out, guesses that
+    /// [`Calibration::UNTRIED`] explains stand for those of the mixture and the extrapolator. Farther ahead
+    /// than any motion lasted, the errors of the last horizon tried stand for those beyond.
     pub(super) fn calibration(self) -> Calibration {
         let mut c = Calibration::UNTRIED;
-        c.straight_m2 = self.straight_m2;
-        c.params.cv_damping = self.damping;
-        c.params.trust = self.trust.solve(Params::DEFAULT.trust);
         if !self.novelties.is_empty() {
             c.novelty90 = quantile(self.novelties, 0.9).max(LEAST_NOVELTY);
         }
@@ -144,32 +115,21 @@ impl<C: Course> Trial<C> {
                 *factor = (quantile(nees, 0.9) / CHI2_3_90).max(f64::from(f32::MIN_POSITIVE));
             }
         }
+        let mut last = None;
+        for (errors, tried) in c.errors.iter_mut().zip(&self.errors) {
+            if let (Some(straight), Some(hold)) = (tried[STRAIGHT].mean(), tried[HOLD].mean()) {
+                let generic = tried[GENERIC].mean().unwrap_or(straight.min(0.5 * hold));
+                let mixture = tried[MIXTURE].mean().unwrap_or(0.25 * hold);
+                last = Some([mixture, generic, straight, hold]);
+            }
+            *errors = last.unwrap_or(*errors);
+        }
         c
     }
 }
 
-/// The weight of an error at knot `j`: relative to how far the hand moves in that time.
-fn share(moved_m2: &[f64; MAX_KNOTS], j: usize) -> f64 {
-    1.0 / moved_m2[j - 1].max(LEAST_M2)
-}
-
-/// Calls `each(knot, undamped constant velocity, truth)` for every moment and knot.
-fn visit<C: Course>(
-    demonstrations: &[Demonstration],
-    knots: usize,
-    mut each: impl FnMut(usize, &Vector3<f64>, &Vector3<f64>),
-) {
-    for d in demonstrations {
-        let end_s = d.last().t_s + 1e-9;
-        for (i, state) in C::states(d).iter().enumerate() {
-            let velocity = C::velocity(state);
-            for j in 1..=knots {
-                let h_s = j as f64 * KNOT_SPACING_S;
-                if d.samples()[i].t_s + h_s > end_s {
-                    break;
-                }
-                each(j, &(velocity * h_s), &C::displacement(d, i, j));
-            }
-        }
-    }
+/// The knots (from 1) at which the truth for a prediction from sample `i` is known.
+fn within(d: &Demonstration, i: usize, knots: usize) -> impl Iterator<Item = usize> {
+    let left_s = d.last().t_s + 1e-9 - d.samples()[i].t_s;
+    (1..=knots).take_while(move |&j| j as f64 * KNOT_SPACING_S <= left_s)
 }

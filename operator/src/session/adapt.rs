@@ -1,27 +1,63 @@
-//! All that adapts adapts here, at the operator, which sees every sample, and travels as numbers
-//! (driving.md §5): how far to trust the mixture, and how much of the velocity lasts. The same for
-//! positions and orientations.
+//! All that adapts adapts here, at the operator, which sees every sample, and travels as numbers: how far to trust each
+//! expert at each horizon, and how sure to be. The same for positions and orientations. No clock, no I/O: a session runs it,
+//! and an evaluation can.
+//!
+//! Every sample is the truth about what was predicted for it. The weights follow the errors seen lately, in relation to how
+//! far the hand moved, beside what the skill's calibration expects of each expert. Three things decide how much that
+//! expectation counts: the motion must be familiar, the mixture as good as it promised, and the hand in motion. *A resting
+//! hand says nothing about the mixture*: at rest everything is right, and a skill knows that motion will begin but not when.
 
 use std::collections::VecDeque;
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 use telemime_protocol::pose;
 use telemime_protocol::predict::{
-    Forecast, HandState, Model, Params, TurnForecast, TurnModel, TurnState, Way,
+    Ahead, BAND_KNOTS, Calibration, Experts, Forecast, HandState, KNOT_SPACING_S, Model, Params,
+    TurnForecast, TurnModel, TurnState, WEIGHTED,
 };
 use telemime_protocol::time::Stamp;
 
-/// What an error made a sample ago still counts.
-const MEMORY: f64 = 0.9;
+/// Time is counted in frames of this length, s: what is learned does not depend on the sensor's rate.
+const FRAME_S: f64 = 1.0 / 30.0;
 
-/// The priors weigh as much as this many samples.
-const PRIOR: f64 = 10.0;
+/// A gap in the samples counts as at most this many frames.
+const LONGEST_FRAMES: f64 = 3.0;
 
-/// Bounds of the mixture's trust before anything was seen: whatever was calibrated can still be outvoted.
-const PRIOR_TRUST: std::ops::RangeInclusive<f64> = 0.05..=0.98;
+/// What an error made a frame ago still counts.
+const MEMORY: f64 = 0.93;
 
-/// Horizons judged at, s: below, everything is right; above, too few verdicts come in.
-const HORIZON_S: std::ops::RangeInclusive<f64> = 0.05..=0.5;
+/// The calibration weighs as much as this many frames, as long as the motion is familiar.
+const PRIOR: f64 = 15.0;
+
+/// Where it is not, the experts are taken as alike at the first horizon, by this many frames …
+const UNKNOWN: f64 = 0.3;
+
+/// … and farther ahead as what is known nearer leads to expect, by this many,
+const CASCADE: f64 = 5.0;
+
+/// errors (squared, against holding) having grown by this factor.
+const GROWTH: [f64; BAND_KNOTS.len() - 1] = [3.0, 4.0];
+
+/// Weights fall with this power of the mean squared errors.
+const POWER: i32 = 3;
+
+/// What a familiar state a frame ago still counts.
+const FAMILIAR_MEMORY: f64 = 0.9;
+
+/// Less than familiar is unfamiliar: the power of the running mean.
+const FAMILIAR_POWER: i32 = 8;
+
+/// A mixture that errs (squared) this many times as much as calibrated is not on its model.
+const SURPRISE: f64 = 32.0;
+
+/// Errors below this are right, m and rad.
+const RIGHT: f64 = 1e-4;
+
+/// A verdict from rest counts as far as the state was unfamiliar: one minus this power of the familiarity.
+const VERDICT_POWER: i32 = 4;
+
+/// How long a hand is seen to rest before it is taken as resting, s: at the first sample nothing is known of before.
+const REST_S: f64 = 0.25;
 
 /// A hand that has moved less than this share of the skill's reach lately is at rest.
 const REST: f64 = 0.02;
@@ -29,36 +65,35 @@ const REST: f64 = 0.02;
 /// A hand that turns less than this lately is at rest, rad.
 const REST_RAD: f64 = 0.02;
 
-/// Without a mixture an error of this size is one: what a depth sensor is good for, m and rad.
-const SENSOR: f64 = 0.01;
+/// The region that is to hold `1 − MISSED` of what happens: 90 % quantile of χ² with three degrees of freedom.
+const REGION: f64 = 6.251;
+const MISSED: f64 = 0.1;
 
-const UNDAMPED: Params = Params {
-    gain: 1.0,
-    trust: 0.0,
-    cv_damping: 1.0,
-};
-const MIXTURE: Params = Params {
-    gain: 1.0,
-    trust: 1.0,
-    cv_damping: 0.0,
-};
+/// By how much the logarithm of the covariance's factor moves in a frame in which every region is missed.
+const WIDENING: f64 = 0.5;
+
+/// ln 2¹⁶.
+const MOST_LN_INFLATION: f64 = 11.09;
 
 /// What is predicted: a state with memories, in a space where differences are vectors (m, rad).
-pub(super) trait Course: Copy {
+pub trait Course: Copy {
     /// Where it is.
     type Point: Copy;
     /// What was learned of it.
     type Model;
 
+    /// When it is valid.
     fn t(&self) -> Stamp;
+    /// Where it is now.
     fn point(&self) -> Self::Point;
     /// From each memory to the present.
     fn ways(&self) -> [Vector3<f64>; 4];
     /// `u` of the way from one point to the other.
     fn between(from: &Self::Point, to: &Self::Point, u: f64) -> Self::Point;
+    /// From one point to the other.
     fn way(from: &Self::Point, to: &Self::Point) -> Vector3<f64>;
-    fn learned(&self, model: &Self::Model, h_s: f64) -> Way;
-    fn straight(&self, h_s: f64) -> Vector3<f64>;
+    /// What each expert says of it.
+    fn experts(&self, model: Option<&Self::Model>) -> Experts;
 }
 
 impl Course for HandState {
@@ -74,7 +109,7 @@ impl Course for HandState {
     }
 
     fn ways(&self) -> [Vector3<f64>; 4] {
-        self.memory.map(|m| self.x - m)
+        HandState::ways(self)
     }
 
     fn between(from: &Vector3<f64>, to: &Vector3<f64>, u: f64) -> Vector3<f64> {
@@ -85,13 +120,8 @@ impl Course for HandState {
         to - from
     }
 
-    fn learned(&self, model: &Model, h_s: f64) -> Way {
-        model.forecast(self, &MIXTURE).ahead.at(h_s)
-    }
-
-    fn straight(&self, h_s: f64) -> Vector3<f64> {
-        let forecast = Forecast::constant_velocity(self, &UNDAMPED);
-        forecast.ahead.at(h_s).displacement
+    fn experts(&self, model: Option<&Model>) -> Experts {
+        Forecast::experts(self, model)
     }
 }
 
@@ -108,7 +138,7 @@ impl Course for TurnState {
     }
 
     fn ways(&self) -> [Vector3<f64>; 4] {
-        self.memory.map(|m| pose::between(&m, &self.q))
+        TurnState::ways(self)
     }
 
     fn between(
@@ -123,92 +153,262 @@ impl Course for TurnState {
         pose::between(from, to)
     }
 
-    fn learned(&self, model: &TurnModel, h_s: f64) -> Way {
-        model.forecast(self, &MIXTURE).ahead.at(h_s)
-    }
-
-    fn straight(&self, h_s: f64) -> Vector3<f64> {
-        let forecast = TurnForecast::constant_velocity(self, &UNDAMPED);
-        forecast.ahead.at(h_s).displacement
+    fn experts(&self, model: Option<&TurnModel>) -> Experts {
+        TurnForecast::experts(self, model)
     }
 }
 
-/// A prediction that waits for its truth: displacements from `origin`.
-struct Pending<P> {
+/// What was said of one horizon, and waits for its truth.
+struct Said {
     due: Stamp,
-    weight: f64,
-    origin: P,
-    mixture: Option<Vector3<f64>>,
-    straight: Vector3<f64>,
+    answers: [Vector3<f64>; WEIGHTED],
+    fused: Vector3<f64>,
+    /// Inverse of the fused covariance before its factor.
+    information: Matrix3<f64>,
 }
 
-pub(super) struct Adaptation<C: Course> {
+/// What was said from one sample: displacements from `origin`.
+struct Pending<P> {
+    origin: P,
+    /// Frames it stands for.
+    frames: f64,
+    /// Frames that its verdict on the experts counts as.
+    weight: f64,
+    said: [Said; BAND_KNOTS.len()],
+}
+
+/// How the experts have done at one horizon: sums over frames, fading.
+#[derive(Clone, Copy, Default)]
+struct Record {
+    squared: [f64; WEIGHTED + 1],
+    frames: f64,
+}
+
+impl Record {
+    /// Mean square of how far the hand has moved (which is how far holding errs).
+    fn moved(&self) -> Option<f64> {
+        (self.frames > 1e-9).then(|| (self.squared[WEIGHTED] / self.frames).max(1e-12))
+    }
+}
+
+/// Adapts the predictor's parameters to what the hand does.
+///
+/// Feed it every sample with [`observe`](Self::observe); ask for [`params`](Self::params) whenever something is sent.
+pub struct Adaptation<C: Course> {
     gain: f64,
-    /// A priori the straight line errs this many times as much (in squares) as the mixture.
-    ratio: f64,
-    damping: f64,
     rest: f64,
+    /// Mean squared errors at each horizon that the calibration expects, in all axes; none without a model.
+    expected: Option<[[f64; WEIGHTED + 1]; BAND_KNOTS.len()]>,
+    /// There was a model to predict the newest sample's future with.
+    learned: bool,
+    records: [Record; BAND_KNOTS.len()],
+    /// Running mean of the familiarity.
+    familiar: Option<f64>,
+    /// For how long the hand has rested, s.
+    rested_s: f64,
+    ln_inflation: f64,
+    /// For each horizon the oldest entry of `pending` that still waits.
+    next: [usize; BAND_KNOTS.len()],
     pending: VecDeque<Pending<C::Point>>,
-    mixture_error: f64,
-    straight_error: f64,
-    prior: Option<f64>,
-    along: f64,
-    square: f64,
 }
 
 impl Adaptation<HandState> {
-    /// For positions; `start` is what was calibrated with the skill, `reach_m` how far it goes.
-    pub(super) fn of_places(gain: f64, start: Option<Params>, reach_m: f64) -> Self {
+    /// For positions, with a gain κ in [0, 1]; `start` is what was calibrated with the skill, `reach_m` how far it goes.
+    pub fn of_places(gain: f64, start: Option<&Calibration>, reach_m: f64) -> Self {
         Self::new(gain, start, (REST * reach_m).max(1e-3))
     }
 }
 
 impl Adaptation<TurnState> {
     /// For orientations.
-    pub(super) fn of_turns(gain: f64, start: Option<Params>) -> Self {
+    pub fn of_turns(gain: f64, start: Option<&Calibration>) -> Self {
         Self::new(gain, start, REST_RAD)
     }
 }
 
 impl<C: Course> Adaptation<C> {
-    /// Starts from what was calibrated, or from the defaults; less than `rest` is no motion.
-    fn new(gain: f64, start: Option<Params>, rest: f64) -> Self {
-        let start = start.unwrap_or(Params::DEFAULT);
-        let trust = start.trust.clamp(*PRIOR_TRUST.start(), *PRIOR_TRUST.end());
+    fn new(gain: f64, start: Option<&Calibration>, rest: f64) -> Self {
+        let at = |c: &Calibration| BAND_KNOTS.map(|knot| c.errors[knot - 1].map(|v| 3.0 * v));
         Self {
             gain: gain.clamp(0.0, 1.0),
-            ratio: (trust / (1.0 - trust)).sqrt(),
-            damping: start.cv_damping,
             rest,
+            expected: start.map(at),
+            learned: start.is_some(),
+            records: [Record::default(); BAND_KNOTS.len()],
+            familiar: None,
+            rested_s: 0.0,
+            ln_inflation: 0.0,
+            next: [0; BAND_KNOTS.len()],
             pending: VecDeque::new(),
-            mixture_error: 0.0,
-            straight_error: 0.0,
-            prior: None,
-            along: 0.0,
-            square: 0.0,
         }
+    }
+
+    /// The hand is known to have rested for this long before the first sample, s.
+    #[must_use]
+    pub fn rested(self, rested_s: f64) -> Self {
+        Self { rested_s, ..self }
     }
 
     /// The numbers that travel, for a prediction from `hand`.
-    ///
-    /// Trust: weights ∝ (mean squared error)⁻² (prediction.md §3), and less while the hand rests: a skill
-    /// knows that motion will begin, not when. Damping: the least-squares factor on the velocity, drawn to
-    /// the calibrated one where nothing has moved yet.
-    pub(super) fn params(&self, hand: &C) -> Params {
-        let prior = self.prior.unwrap_or(1.0);
-        let mixture = (self.mixture_error + prior).powi(2);
-        let straight = (self.straight_error + self.ratio * prior).powi(2);
-        let trust = self.moving(hand) * straight / (straight + mixture);
+    pub fn params(&self, hand: &C) -> Params {
         Params {
             gain: self.gain,
-            trust,
-            cv_damping: self.cv_damping(),
+            inflation: self.ln_inflation.exp(),
+            weights: self.weights(hand),
         }
     }
 
-    fn cv_damping(&self) -> f64 {
-        let prior = self.prior.unwrap_or(1.0);
-        ((self.along + self.damping * prior) / (self.square + prior)).clamp(0.0, 1.0)
+    /// Judges what was predicted for the time up to `newest`, and notes what is predicted from there.
+    ///
+    /// `previous` is the sample before; `model` what the robot predicts with, if it has one.
+    pub fn observe(&mut self, previous: &C, newest: &C, model: Option<&C::Model>) {
+        let span_s = newest.t().secs_since(previous.t());
+        let frames = (span_s / FRAME_S).clamp(0.0, LONGEST_FRAMES);
+        self.learned = model.is_some();
+        let fade = MEMORY.powf(frames);
+        for record in &mut self.records {
+            record.squared.iter_mut().for_each(|v| *v *= fade);
+            record.frames *= fade;
+        }
+        self.judge(previous, newest, span_s);
+        let moving = self.moving(newest);
+        self.rested_s = (self.rested_s + span_s) * (1.0 - moving);
+
+        let experts = newest.experts(model);
+        let fade = FAMILIAR_MEMORY.powf(frames);
+        let familiar = match self.familiar {
+            Some(before) => before * fade + experts.familiarity * (1.0 - fade),
+            None => experts.familiarity,
+        };
+        self.familiar = Some(familiar);
+        let params = Params {
+            gain: 1.0,
+            inflation: 1.0,
+            weights: self.weights(newest),
+        };
+        let ahead = Ahead::fused(&experts, &params);
+        let unfamiliar = 1.0 - experts.familiarity.powi(VERDICT_POWER);
+        let said = BAND_KNOTS.map(|knot| {
+            let knot = knot.min(experts.count);
+            let fused = &ahead.knots[knot];
+            let [xx, xy, xz, yy, yz, zz] = fused.covariance;
+            let covariance = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz);
+            Said {
+                due: newest.t().offset_by_secs(knot as f64 * KNOT_SPACING_S),
+                answers: experts.displacement[knot - 1],
+                fused: fused.displacement,
+                information: covariance.try_inverse().unwrap_or_else(Matrix3::zeros),
+            }
+        });
+        self.pending.push_back(Pending {
+            origin: newest.point(),
+            frames,
+            weight: frames * (moving + (1.0 - moving) * unfamiliar),
+            said,
+        });
+    }
+
+    /// What the newest sample says of what was foretold of it.
+    fn judge(&mut self, previous: &C, newest: &C, span_s: f64) {
+        for band in 0..BAND_KNOTS.len() {
+            while let Some(pending) = self.pending.get(self.next[band]) {
+                let said = &pending.said[band];
+                if said.due > newest.t() {
+                    break;
+                }
+                self.next[band] += 1;
+                let u = (said.due.secs_since(previous.t()) / span_s).clamp(0.0, 1.0);
+                let truth = C::between(&previous.point(), &newest.point(), u);
+                let moved = C::way(&pending.origin, &truth);
+                let record = &mut self.records[band];
+                record.frames += pending.weight;
+                for (sum, answer) in record.squared.iter_mut().zip(&said.answers) {
+                    *sum += pending.weight * (answer - moved).norm_squared();
+                }
+                record.squared[WEIGHTED] += pending.weight * moved.norm_squared();
+                let e = said.fused - moved;
+                let missed = e.dot(&(said.information * e)) > REGION * self.ln_inflation.exp();
+                let step = WIDENING * pending.frames / BAND_KNOTS.len() as f64;
+                self.ln_inflation += step * (f64::from(u8::from(missed)) - MISSED);
+            }
+        }
+        self.ln_inflation = self
+            .ln_inflation
+            .clamp(-MOST_LN_INFLATION, MOST_LN_INFLATION);
+        let done = self.next.into_iter().min().unwrap_or(0);
+        self.pending.drain(..done);
+        self.next = self.next.map(|next| next - done);
+    }
+
+    /// How much the calibration counts, from 0 to 1.
+    fn credit(&self) -> f64 {
+        let Some(expected) = &self.expected else {
+            return 0.0;
+        };
+        let familiar = self.familiar.unwrap_or(1.0).powi(FAMILIAR_POWER);
+        let [mixture, .., hold] = expected[0];
+        let record = &self.records[0];
+        let Some(moved) = record.moved() else {
+            return familiar;
+        };
+        let promised = mixture / hold * moved;
+        let surprise =
+            (record.squared[0] + PRIOR * promised) / ((record.frames + PRIOR) * promised);
+        let ratio = surprise / SURPRISE;
+        familiar / (1.0 + ratio * ratio)
+    }
+
+    /// Weights ∝ (mean squared error)⁻³ at every horizon.
+    fn weights(&self, hand: &C) -> [[f64; WEIGHTED]; BAND_KNOTS.len()] {
+        let credit = self.credit();
+        let moving = self.moving(hand);
+        let moving = moving + (1.0 - moving) * (-self.rested_s / REST_S).exp();
+        let mut nearer: Option<[f64; WEIGHTED + 1]> = None;
+        let mut out = [[0.0; WEIGHTED]; BAND_KNOTS.len()];
+        for (band, weights) in out.iter_mut().enumerate() {
+            let record = &self.records[band];
+            let unknown = match nearer {
+                None => [UNKNOWN; WEIGHTED + 1],
+                Some(errors) => {
+                    let grown = |e: f64| (e * GROWTH[band - 1]).min(1e4);
+                    let [mixture, generic, straight, hold] = errors;
+                    [grown(mixture), grown(generic), grown(straight), hold].map(|e| CASCADE * e)
+                }
+            };
+            let expected = self.expected.map(|expected| expected[band]);
+            let hold = expected.map_or(1.0, |e| e[WEIGHTED]);
+            let moved = record.moved().unwrap_or(hold);
+            let right = RIGHT * RIGHT * (record.frames + PRIOR);
+            let errors: [f64; WEIGHTED + 1] = std::array::from_fn(|e| {
+                let calibrated = expected.map_or(0.0, |expected| PRIOR * expected[e] / hold);
+                let prior = credit * calibrated + (1.0 - credit) * unknown[e];
+                record.squared[e] + prior * moved + right
+            });
+            nearer = Some(errors.map(|e| e / errors[WEIGHTED]));
+            // Without a model there are two experts.
+            let learned = if self.learned { 0 } else { 2 };
+            let least = errors[learned..]
+                .iter()
+                .copied()
+                .fold(f64::INFINITY, f64::min);
+            let raw: [f64; WEIGHTED + 1] = std::array::from_fn(|e| {
+                if e < learned {
+                    0.0
+                } else {
+                    (least / errors[e]).powi(POWER)
+                }
+            });
+            let total: f64 = raw.iter().sum();
+            let share = raw.map(|w| w / total);
+            let mixture = share[0] * moving;
+            let others = if share[0] < 1.0 {
+                (1.0 - mixture) / (1.0 - share[0])
+            } else {
+                0.0
+            };
+            *weights = [mixture, share[1] * others, share[2] * others];
+        }
+        out
     }
 
     /// From 0 for a hand at rest to 1 for one in motion.
@@ -219,50 +419,5 @@ impl<C: Course> Adaptation<C> {
             .map(Vector3::norm_squared)
             .fold(0.0, f64::max);
         moved / (moved + self.rest * self.rest)
-    }
-
-    /// Judges what was predicted for the time up to `newest`, and predicts `horizon_s` ahead of it.
-    pub(super) fn observe(
-        &mut self,
-        previous: &C,
-        newest: &C,
-        model: Option<&C::Model>,
-        horizon_s: f64,
-    ) {
-        let span_s = newest.t().secs_since(previous.t());
-        while self.pending.front().is_some_and(|p| p.due <= newest.t()) {
-            let Some(pending) = self.pending.pop_front() else {
-                break;
-            };
-            let u = (pending.due.secs_since(previous.t()) / span_s).clamp(0.0, 1.0);
-            let truth = C::between(&previous.point(), &newest.point(), u);
-            self.judge(&pending, &C::way(&pending.origin, &truth));
-        }
-        let horizon_s = horizon_s.clamp(*HORIZON_S.start(), *HORIZON_S.end());
-        let mixture = model.map(|model| newest.learned(model, horizon_s));
-        if self.prior.is_none() {
-            let sigma = mixture.map_or(SENSOR, |way| way.sigma);
-            self.prior = Some(PRIOR * (3.0 * sigma * sigma).max(1e-8));
-        }
-        self.pending.push_back(Pending {
-            due: newest.t().offset_by_secs(horizon_s),
-            weight: self.moving(newest),
-            origin: newest.point(),
-            mixture: mixture.map(|way| way.displacement),
-            straight: newest.straight(horizon_s),
-        });
-    }
-
-    fn judge(&mut self, pending: &Pending<C::Point>, moved: &Vector3<f64>) {
-        let run = pending.straight;
-        let straight = run * self.cv_damping();
-        self.straight_error =
-            MEMORY * self.straight_error + pending.weight * (straight - moved).norm_squared();
-        if let Some(mixture) = pending.mixture {
-            self.mixture_error =
-                MEMORY * self.mixture_error + pending.weight * (mixture - moved).norm_squared();
-        }
-        self.along = MEMORY * self.along + run.dot(moved);
-        self.square = MEMORY * self.square + run.norm_squared();
     }
 }

@@ -8,7 +8,7 @@ mod leeway;
 
 use nalgebra::Vector3;
 use telemime_protocol::checkpoint::PoseCurve;
-use telemime_protocol::predict::{Bend, HandState, LET_GO_TAU_S, MAX_RATE, Params};
+use telemime_protocol::predict::{Bend, HandState, LET_GO_TAU_S, MAX_RATE};
 use telemime_protocol::skill::chi_squared_quantile;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::bend::{WireBend, WireHeld};
@@ -38,6 +38,9 @@ const HALTING: f64 = 2.0;
 
 /// Below this speed a plan's direction counts for less, m/s.
 const STILL_M_S: f64 = 0.05;
+
+/// A push is predicted half as far as its speed would take it: it is about to end.
+const STRAIGHT: f64 = 0.5;
 
 /// While a hand bends the plan, or has just done, that is looked at this often, s.
 const LOOK_S: f64 = 0.02;
@@ -129,7 +132,8 @@ pub(super) struct Correction {
     leeway: Leeway,
     hand_sigma_m: f64,
     bound: FutureBound,
-    params: Params,
+    /// Prediction gain κ.
+    gain: f64,
     /// The plan's time and rate at this moment at the arm; `None` until the robot has engaged.
     clock: Option<(Stamp, f64, f64)>,
     hold: Option<Hold>,
@@ -146,10 +150,7 @@ impl Correction {
             leeway,
             hand_sigma_m: config.hand_sigma_m,
             bound: config.future_bound,
-            params: Params {
-                gain: config.gain,
-                ..Params::DEFAULT
-            },
+            gain: config.gain,
             clock: None,
             hold: None,
             left: (Stamp::ZERO, Vector3::zeros()),
@@ -307,7 +308,12 @@ impl Correction {
         let held = match &self.hold {
             Some(hold) => {
                 let weight = self.fusion(now).weight;
-                Some(WireHeld::quantise(&hold.state, &self.params, &weight)?)
+                Some(WireHeld::quantise(
+                    &hold.state,
+                    self.gain,
+                    STRAIGHT,
+                    &weight,
+                )?)
             }
             None => None,
         };

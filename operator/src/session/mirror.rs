@@ -43,6 +43,9 @@ const COPIES: u8 = 2;
 /// … and again when it is still not acknowledged after the round trip and this long, s.
 const PATIENCE_S: f64 = 0.15;
 
+/// A hand that is not moving when it engages has rested: the arm must not begin what the person has not begun, s.
+const RESTED_S: f64 = 10.0;
+
 /// A knot the robot may not have yet.
 struct Unacknowledged {
     knot: PathKnot,
@@ -90,15 +93,17 @@ impl Mirror {
             first_unacknowledged: 0,
             places: Adaptation::of_places(
                 gain,
-                skill.map(|skill| skill.predictor().calibration().params),
+                skill.map(|skill| skill.predictor().calibration()),
                 skill.map_or(0.0, |skill| skill.stats().reach_m),
-            ),
+            )
+            .rested(RESTED_S),
             turns: Adaptation::of_turns(
                 gain,
                 skill
                     .and_then(Skill::turn)
-                    .map(|turn| turn.predictor.model().calibration().params),
-            ),
+                    .map(|turn| turn.predictor.model().calibration()),
+            )
+            .rested(RESTED_S),
             without_model: false,
             newest: None,
             sent: None,
@@ -138,23 +143,15 @@ impl Mirror {
         self.first_unacknowledged += known as u32;
     }
 
-    /// Takes the newest hand state; `horizon_s` is how far ahead the robot will have to look.
-    /// Says whether a knot was made.
-    pub(super) fn take(
-        &mut self,
-        previous: &Hand,
-        hand: Hand,
-        skill: Option<&Skill>,
-        horizon_s: f64,
-    ) -> bool {
+    /// Takes the newest hand state; says whether a knot was made.
+    pub(super) fn take(&mut self, previous: &Hand, hand: Hand, skill: Option<&Skill>) -> bool {
         self.hand = hand;
         let skill = skill.filter(|_| !self.without_model);
         let model = skill.map(Skill::predictor);
-        self.places
-            .observe(&previous.place, &hand.place, model, horizon_s);
+        self.places.observe(&previous.place, &hand.place, model);
         if let (Some(previous), Some(turn)) = (&previous.turn, &hand.turn) {
             let model = skill.and_then(Skill::turn).map(|turn| &turn.predictor);
-            self.turns.observe(previous, turn, model, horizon_s);
+            self.turns.observe(previous, turn, model);
         }
         self.newest = self.travelling().map(|t| t.known(skill));
         // A sample the path cannot hold (out of the grid's range) is still good for the future.

@@ -3,7 +3,7 @@
 //! Call order: any `handle_*` or command, then [`Session::poll_output`] and [`Session::poll_event`] until
 //! both are empty, then [`Session::poll_timeout`] for when to call [`Session::handle_timeout`].
 
-mod adapt;
+pub mod adapt;
 mod beside;
 mod config;
 mod correct;
@@ -199,7 +199,7 @@ impl Session {
         } else {
             self.counters.samples += 1;
         }
-        self.counters.knots += u32::from(mirror.take(&previous, hand, skill, self.delay_s + lag_s));
+        self.counters.knots += u32::from(mirror.take(&previous, hand, skill));
         let backlog = mirror.backlog();
         let arrival = now.offset_by_secs(self.delay_s + lag_s);
         let silent_s = now.secs_since(self.last_sent);

@@ -1,12 +1,20 @@
-//! From the mixture's answer to a predicted way: the off-model guard. In metres for positions, in radians
+//! From the experts' answers to a predicted way: the off-model guard. In metres for positions, in radians
 //! (the present's own axes) for orientations.
 
 use nalgebra::Vector3;
 
-use super::{KNOT_SPACING_S, MAX_KNOTS, Model, Params, Posterior};
+use super::params::WEIGHTED;
+use super::{BLOCK, Experts, KNOT_SPACING_S, MAX_KNOTS, Params};
 
-/// Novelty is counted in multiples of this many 90 % quantiles before trust halves.
-const NOVELTY_MARGIN: f64 = 8.0;
+/// What novelty takes from the mixture goes to the other experts by their weights and this much.
+const LEAST_WEIGHT: f64 = 1.0 / 255.0;
+
+/// Without a model, the straight line gets this share of the learned experts' weights: over fast gestures undamped
+/// extrapolation is worse than standing still beyond 0.15 s.
+const UNLEARNED_SHARE: f64 = 0.5;
+
+/// Nothing is known better than to this, m/s or rad/s.
+const FLOOR: f64 = 0.01;
 
 /// Horizons at which two ends compare their predictions, s.
 pub(super) const CHECK_HORIZONS_S: [f64; 3] = [0.1, 0.2, 0.4];
@@ -32,6 +40,16 @@ pub(super) struct Motion {
     pub(super) acceleration: Vector3<f64>,
     /// What rests may start at any moment, about this fast.
     pub(super) onset: f64,
+    /// As far as a straight line ever goes.
+    pub(super) reach: f64,
+}
+
+impl Motion {
+    /// `v·h/√(1 + |v·h|²/L²)`: constant velocity, but no motion of a hand goes on for longer than it can reach.
+    pub(super) fn straight(&self, h_s: f64) -> Vector3<f64> {
+        let way = self.velocity * h_s;
+        way / (1.0 + way.norm_squared() / (self.reach * self.reach)).sqrt()
+    }
 }
 
 /// A predicted displacement and how far to trust it.
@@ -39,12 +57,15 @@ pub(super) struct Motion {
 pub struct Knot {
     /// Displacement from the newest position or orientation, m or rad.
     pub displacement: Vector3<f64>,
+    /// Its covariance, m² or rad²: xx, xy, xz, yy, yz, zz.
+    pub covariance: [f64; BLOCK],
     /// Standard deviation along any one axis (root mean over the three), m or rad.
     pub sigma: f64,
 }
 
 const STILL: Knot = Knot {
     displacement: Vector3::new(0.0, 0.0, 0.0),
+    covariance: [0.0; BLOCK],
     sigma: 0.0,
 };
 
@@ -57,8 +78,8 @@ pub struct Ahead {
     pub count: usize,
     /// Squared Mahalanobis distance of the state to the nearest component; infinite without a model.
     pub novelty: f64,
-    /// The weight the mixture got against constant velocity, in [0, 1]; 0 without a model.
-    pub weight: f64,
+    /// The share of its weight that novelty leaves the mixture, in [0, 1]; 0 without a model.
+    pub familiarity: f64,
 }
 
 /// One moment of an [`Ahead`].
@@ -73,68 +94,69 @@ pub struct Way {
 }
 
 impl Ahead {
-    /// Damped constant velocity alone, to the farthest knot.
-    pub(super) fn straight(motion: &Motion, params: &Params) -> Self {
-        let speed2 = motion.velocity.norm_squared() + motion.onset * motion.onset;
+    /// Fuses the experts: `x̂ = x + κ·Σ w_e·y_e`, and the covariance of that mixture, the distances between the experts included,
+    /// `φ·Σ w_e·(C_e + (y_e − ȳ)(y_e − ȳ)ᵀ)`.
+    ///
+    /// What novelty takes from the mixture goes to the others in proportion to their own weights.
+    pub fn fused(experts: &Experts, params: &Params) -> Self {
         let mut knots = [STILL; MAX_KNOTS + 1];
-        for (j, knot) in knots.iter_mut().enumerate().skip(1) {
-            let h_s = j as f64 * KNOT_SPACING_S;
-            let bend2 = 0.25 * motion.acceleration.norm_squared() * h_s * h_s;
-            *knot = Knot {
-                displacement: motion.velocity * (params.cv_damping * h_s * params.gain),
-                sigma: h_s * ((speed2 + bend2) / 3.0).sqrt(),
-            };
-        }
-        Self {
-            knots,
-            count: MAX_KNOTS,
-            novelty: f64::INFINITY,
-            weight: 0.0,
-        }
-    }
-
-    /// `w = trust/(1+(d²/(8·nov₉₀))²)`, `x̂ = x + κ·(w·gmr + (1−w)·cv)`; the deviation is that of the
-    /// mixture of the two experts, the distance between them included.
-    pub(super) fn blended(
-        model: &Model,
-        posterior: &Posterior,
-        motion: &Motion,
-        params: &Params,
-    ) -> Self {
-        let calibration = model.calibration();
-        let excess = posterior.novelty / (NOVELTY_MARGIN * calibration.novelty90);
-        let weight = params.trust / (1.0 + excess * excess);
-        // Where the mixture's density underflows it has no answer that could be weighted with zero.
-        let silent = weight.is_nan() || weight <= 0.0;
-        let weight = if silent { 0.0 } else { weight };
-        let velocity = motion.velocity * params.cv_damping;
-        let mut knots = [STILL; MAX_KNOTS + 1];
-        for j in 1..=model.knots() {
-            let i = j - 1;
-            let straight = velocity * (j as f64 * KNOT_SPACING_S);
-            let (learned, learned_2) = if silent {
-                (straight, 0.0)
+        for j in 1..=experts.count {
+            let answers = &experts.displacement[j - 1];
+            let [mixture, generic, straight] = params.at(j);
+            let (weights, hold) = if experts.learned {
+                let hold = (1.0 - mixture - generic - straight).max(0.0);
+                let kept = mixture * experts.familiarity;
+                let others = generic + straight + hold + 3.0 * LEAST_WEIGHT;
+                let share = (mixture - kept) / others;
+                let more = |w: f64| w + share * (w + LEAST_WEIGHT);
+                ([kept, more(generic), more(straight)], more(hold))
             } else {
-                let trace = posterior.covariance[i].trace();
-                (
-                    posterior.displacement[i],
-                    calibration.covariance[i] * trace / 3.0,
-                )
+                let straight = straight + UNLEARNED_SHARE * (mixture + generic);
+                ([0.0, 0.0, straight], 1.0 - straight)
             };
-            let between = (learned - straight).norm_squared() / 3.0;
-            let displacement = learned * weight + straight * (1.0 - weight);
-            let variance = weight * learned_2
-                + (1.0 - weight) * (calibration.straight_m2[i] + weight * between);
+            let mean = answers[0] * weights[0] + answers[1] * weights[1] + answers[2] * weights[2];
+            let mut covariance = experts.mixture[j - 1].map(|v| v * weights[0]);
+            let others = &experts.others[j - 1];
+            let h_s = j as f64 * KNOT_SPACING_S;
+            let round = FLOOR * FLOOR * h_s * h_s
+                + weights[1] * others[0]
+                + weights[2] * others[1]
+                + hold * others[2];
+            for axis in [0, 3, 5] {
+                covariance[axis] += round;
+            }
+            let mut apart = |w: f64, d: Vector3<f64>| {
+                let outer = [
+                    d.x * d.x,
+                    d.x * d.y,
+                    d.x * d.z,
+                    d.y * d.y,
+                    d.y * d.z,
+                    d.z * d.z,
+                ];
+                for (c, o) in covariance.iter_mut().zip(outer) {
+                    *c += w * o;
+                }
+            };
+            for e in 0..WEIGHTED {
+                // An expert without weight may be anywhere.
+                if weights[e] > 0.0 {
+                    apart(weights[e], answers[e] - mean);
+                }
+            }
+            apart(hold, mean);
+            let covariance = covariance.map(|v| v * params.inflation);
             knots[j] = Knot {
-                displacement: displacement * params.gain,
-                sigma: variance.sqrt(),
+                displacement: mean * params.gain,
+                covariance,
+                sigma: ((covariance[0] + covariance[3] + covariance[5]) / 3.0).sqrt(),
             };
         }
         Self {
             knots,
-            count: model.knots(),
-            novelty: posterior.novelty,
-            weight,
+            count: experts.count,
+            novelty: experts.novelty,
+            familiarity: experts.familiarity,
         }
     }
 

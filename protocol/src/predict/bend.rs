@@ -84,7 +84,7 @@ mod tests {
             state.advance(t, v * t.as_secs_f64());
         }
         Held {
-            push: Forecast::constant_velocity(&state, &Params::DEFAULT),
+            push: Forecast::constant_velocity(&state, &Params::only([0.0, 0.0, 0.5])),
             weight: Matrix3::from_diagonal(&Vector3::new(1.0, 0.5, 1.0)),
         }
     }
@@ -107,10 +107,11 @@ mod tests {
         bend.held = Some(held);
         assert!(!bend.is_over(99.0), "a hand that holds on is never nothing");
         let offset = |h: f64| bend.offset_at(f64::INFINITY, h)[1];
-        // Half of the way, and of its half-damped speed.
+        // Half of the way, and of what is predicted of it.
         let x = held.push.x[1];
         assert!((offset(0.0) - 0.5 * x).abs() < 1e-12);
-        assert!((offset(0.1) - 0.5 * (x + 0.5 * 0.3 * 0.1)).abs() < 1e-6);
+        let ahead = 0.5 * held.push.at(0.1).position[1];
+        assert!((offset(0.1) - ahead).abs() < 1e-12 && ahead > 0.5 * x + 5e-3);
         assert!(offset(PUSH_REACH_S) > offset(0.2));
         assert_eq!(offset(PUSH_REACH_S), offset(0.6));
     }

@@ -1,69 +1,16 @@
-//! The predicted path of the hand, and the parameters that travel.
+//! The predicted path of the hand.
 
 use nalgebra::Vector3;
-use serde::{Deserialize, Serialize};
 
 use super::ahead::{Ahead, Motion};
-use super::{HandState, MEMORY_TAU_S, Model};
+use super::{Experts, HandState, MEMORY_TAU_S, Model, Params};
 use crate::time::Stamp;
 
 /// A hand at rest may start at any moment, about this fast, m/s.
 const ONSET_M_S: f64 = 0.5;
 
-/// What the operator adapts, as plain numbers that travel.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Params {
-    /// Gain κ on every predicted displacement, in [0, 1]; 0 holds the newest position.
-    pub gain: f64,
-    /// Weight of the mixture against constant velocity before novelty is considered, in [0, 1].
-    pub trust: f64,
-    /// Factor on the velocity of the constant-velocity expert, in [0, 1]; 1 is undamped.
-    pub cv_damping: f64,
-}
-
-/// A parameter is outside [0, 1], or NaN.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-#[error("predictor parameter {field} is {value}, not in [0, 1]")]
-pub struct ParamsError {
-    /// The parameter.
-    pub field: &'static str,
-    /// Its value.
-    pub value: f64,
-}
-
-impl Default for Params {
-    /// [`Params::DEFAULT`].
-    fn default() -> Self {
-        Self::DEFAULT
-    }
-}
-
-impl Params {
-    /// Full prediction, full trust in the mixture, and off the model half of the present velocity:
-    /// over fast gestures undamped extrapolation is worse than standing still beyond 0.15 s.
-    pub const DEFAULT: Self = Self {
-        gain: 1.0,
-        trust: 1.0,
-        cv_damping: 0.5,
-    };
-
-    /// These parameters, if each is in [0, 1].
-    ///
-    /// # Errors
-    /// [`ParamsError`] names the first that is not.
-    pub fn checked(self) -> Result<Self, ParamsError> {
-        for (field, value) in [
-            ("gain", self.gain),
-            ("trust", self.trust),
-            ("cv_damping", self.cv_damping),
-        ] {
-            if !(0.0..=1.0).contains(&value) {
-                return Err(ParamsError { field, value });
-            }
-        }
-        Ok(self)
-    }
-}
+/// No motion of a hand goes straight on for longer than about this, m.
+const REACH_M: f64 = 0.3;
 
 /// The predicted path of the hand from one state: plain numbers, no reference to the model.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -88,23 +35,29 @@ pub struct Prediction {
 }
 
 impl Forecast {
-    /// Damped constant velocity alone, to the farthest knot: the prediction where no model is there.
-    ///
-    /// Its deviation is a wide guess: as if the hand might as well stop, turn or, from rest, start.
-    pub fn constant_velocity(state: &HandState, params: &Params) -> Self {
-        Self {
-            t: state.t,
-            x: state.x,
-            ahead: Ahead::straight(&Motion::of(state), params),
+    /// What each expert says: without a model only the straight line (and holding).
+    pub fn experts(state: &HandState, model: Option<&Model>) -> Experts {
+        let motion = Motion::of(state);
+        match model {
+            Some(model) => Experts::all(model, &model.posterior(state), &state.ways(), &motion),
+            None => Experts::straight(&motion),
         }
     }
 
-    pub(super) fn blended(model: &Model, state: &HandState, params: &Params) -> Self {
+    /// Their answers, fused: what both ends predict. A pure function; allocates nothing.
+    pub fn fused(state: &HandState, experts: &Experts, params: &Params) -> Self {
         Self {
             t: state.t,
             x: state.x,
-            ahead: Ahead::blended(model, &model.posterior(state), &Motion::of(state), params),
+            ahead: Ahead::fused(experts, params),
         }
+    }
+
+    /// Straight on or holding, to the farthest knot: the prediction where no model is there.
+    ///
+    /// Its deviation is a wide guess: as if the hand might as well stop, turn or, from rest, start.
+    pub fn constant_velocity(state: &HandState, params: &Params) -> Self {
+        Self::fused(state, &Self::experts(state, None), params)
     }
 
     /// The hand `h_s` seconds after `t`: linear between knots, held beyond the last one and said so;
@@ -131,6 +84,7 @@ impl Motion {
             velocity,
             acceleration,
             onset: ONSET_M_S,
+            reach: REACH_M,
         }
     }
 }
@@ -143,6 +97,11 @@ impl HandState {
     /// for .099) and Kinect gestures worse by 2 to 7 %, where constant velocity has little weight.
     pub fn motion(&self) -> (Vector3<f64>, Vector3<f64>) {
         motion(self.x - self.memory[0], self.x - self.memory[1])
+    }
+
+    /// From each memory to the present, m.
+    pub fn ways(&self) -> [Vector3<f64>; 4] {
+        self.memory.map(|m| self.x - m)
     }
 }
 

@@ -6,17 +6,21 @@
 
 mod ahead;
 mod bend;
+mod experts;
 mod forecast;
 mod model;
+mod params;
 mod state;
 mod turn;
 
 pub use ahead::{Ahead, Knot, Way};
 pub use bend::{Bend, Held, LET_GO_TAU_S, MAX_RATE, PUSH_REACH_S};
-pub use forecast::{Forecast, Params, ParamsError, Prediction};
+pub use experts::{Experts, Generic};
+pub use forecast::{Forecast, Prediction};
 pub use model::{
     BLOCK, Calibration, Model, ModelError, Posterior, Regression, Standardisation, TARGETS, TEMPER,
 };
+pub use params::{BAND_KNOTS, Params, ParamsError, WEIGHTED};
 pub use state::{FEATURES, HandState, MEMORY_TAU_S};
 pub use turn::{TurnForecast, TurnModel, TurnPrediction, TurnState, checksum};
 

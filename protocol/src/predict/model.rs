@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
 use super::state::{FEATURES, HandState};
-use super::{Forecast, KNOT_SPACING_S, MAX_KNOTS, Params, ParamsError};
+use super::{Forecast, Generic, KNOT_SPACING_S, MAX_KNOTS, Params};
 use crate::skill::MAX_COMPONENTS;
 use crate::skill::gmm::{softmax, solve_lower};
 
@@ -46,9 +46,6 @@ pub enum ModelError {
         /// Where.
         field: &'static str,
     },
-    /// A parameter is outside its range.
-    #[error(transparent)]
-    Params(#[from] ParamsError),
     /// Not one chart for each component.
     #[error("{found} charts for {expected} predictor components")]
     Charts {
@@ -107,31 +104,29 @@ pub struct Posterior {
 pub struct Calibration {
     /// Factors c_h on the mixture's covariance, one a knot, > 0.
     pub covariance: [f64; MAX_KNOTS],
-    /// Mean squared error of constant velocity along one axis, one a knot, m², > 0.
-    pub straight_m2: [f64; MAX_KNOTS],
+    /// Mean squared errors along one axis of mixture, generic extrapolator, straight line and holding, at each knot, m², > 0.
+    pub errors: [[f64; 4]; MAX_KNOTS],
     /// The 90 % quantile of the novelty, > 0.
     pub novelty90: f64,
-    /// The parameters that did best: where the operator's adaptation starts.
-    pub params: Params,
 }
 
 impl Calibration {
-    /// What to assume before anything was tried: the covariance factor that three demonstrations of a
-    /// Kinect gesture need at 300 ms, constant velocity wrong by its own spread of 0.5 m/s, and the
-    /// 90 % quantile of χ² with [`FEATURES`] degrees of freedom.
+    /// What to assume before anything was tried: the covariance factor that three demonstrations of a Kinect gesture need
+    /// at 300 ms, motion of 0.5 m/s along each axis that a straight line foretells no better than holding does, the
+    /// extrapolator by 0.7 and the mixture by half of that; and the 90 % quantile of χ² with [`FEATURES`] degrees of freedom.
     pub const UNTRIED: Self = {
-        let mut straight_m2 = [0.0; MAX_KNOTS];
+        let mut errors = [[0.0; 4]; MAX_KNOTS];
         let mut j = 0;
         while j < MAX_KNOTS {
-            let error_m = 0.5 * (j + 1) as f64 * KNOT_SPACING_S;
-            straight_m2[j] = error_m * error_m;
+            let way_m = 0.5 * (j + 1) as f64 * KNOT_SPACING_S;
+            let hold = way_m * way_m;
+            errors[j] = [0.25 * hold, 0.5 * hold, hold, hold];
             j += 1;
         }
         Self {
             covariance: [2.5; MAX_KNOTS],
-            straight_m2,
+            errors,
             novelty90: 22.307,
-            params: Params::DEFAULT,
         }
     };
 }
@@ -142,6 +137,7 @@ pub struct Model {
     knots: usize,
     standardisation: Standardisation,
     components: Vec<Regression>,
+    generic: Generic,
     /// ln π − Σ ln Lᵢᵢ of each component.
     log_scale: Vec<f64>,
     calibration: Calibration,
@@ -158,6 +154,7 @@ impl Model {
         knots: usize,
         standardisation: Standardisation,
         components: Vec<Regression>,
+        generic: Generic,
         calibration: Calibration,
     ) -> Result<Self, ModelError> {
         if !(1..=MAX_KNOTS).contains(&knots) {
@@ -171,9 +168,14 @@ impl Model {
         finite("a feature mean", standardisation.mean.iter())?;
         positive("a feature scale", standardisation.scale.iter())?;
         positive("a covariance factor", calibration.covariance.iter())?;
-        positive("a mean squared error", calibration.straight_m2.iter())?;
+        positive("a mean squared error", calibration.errors.iter().flatten())?;
         positive("the novelty quantile", [calibration.novelty90].iter())?;
-        calibration.params.checked()?;
+        finite("a generic factor", generic.lead.iter().flatten())?;
+        finite("a product of motion", generic.products.iter())?;
+        positive(
+            "a mean square of motion",
+            [0, 2, 5, 9].map(|i| generic.products[i]).iter(),
+        )?;
         let mut log_scale = Vec::with_capacity(components.len());
         for (component, c) in components.iter().enumerate() {
             positive("a weight", [c.weight].iter())?;
@@ -196,6 +198,7 @@ impl Model {
             knots,
             standardisation,
             components,
+            generic,
             log_scale,
             calibration,
             exponents: None,
@@ -229,16 +232,21 @@ impl Model {
         &self.components
     }
 
+    /// The factors of the generic extrapolator.
+    pub fn generic(&self) -> &Generic {
+        &self.generic
+    }
+
     /// What held-out motion has shown.
     pub fn calibration(&self) -> &Calibration {
         &self.calibration
     }
 
-    /// Predicts from `state` by this mixture, blended with constant velocity where the motion is new.
+    /// Predicts from `state` by this mixture, and by the other experts where the motion is new.
     ///
     /// A pure function; allocates nothing.
     pub fn forecast(&self, state: &HandState, params: &Params) -> Forecast {
-        Forecast::blended(self, state, params)
+        Forecast::fused(state, &Forecast::experts(state, Some(self)), params)
     }
 
     /// Conditions the mixture on the state's features.

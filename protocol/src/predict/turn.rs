@@ -8,12 +8,15 @@ use nalgebra::{SVector, UnitQuaternion, Vector3};
 use super::ahead::{Ahead, CHECK_HORIZONS_S, FOLD_SEED, Motion, fold};
 use super::forecast::{Forecast, motion};
 use super::state::blend;
-use super::{FEATURES, MEMORY_TAU_S, Model, ModelError, Params, Posterior};
+use super::{Experts, FEATURES, MEMORY_TAU_S, Model, ModelError, Params, Posterior};
 use crate::pose;
 use crate::time::Stamp;
 
 /// A hand that does not turn may begin to at any moment, about this fast, rad/s.
 const ONSET_RAD_S: f64 = 1.0;
+
+/// No hand turns straight on for longer than about this, rad.
+const REACH_RAD: f64 = 1.0;
 
 /// The newest orientation of the hand with exponential memories of how it was turned.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -67,19 +70,26 @@ impl TurnState {
         f
     }
 
-    fn motion(&self) -> Motion {
-        let ahead = |i: usize| pose::between(&self.memory[i], &self.q);
-        let (velocity, acceleration) = motion(ahead(0), ahead(1));
-        Motion {
-            velocity,
-            acceleration,
-            onset: ONSET_RAD_S,
-        }
+    /// From each memory to the present, rad, in the present's own axes.
+    pub fn ways(&self) -> [Vector3<f64>; 4] {
+        self.memory.map(|m| pose::between(&m, &self.q))
     }
 
     /// Angular velocity (rad/s, in the hand's own axes) that the two quickest memories imply.
     pub fn angular_velocity(&self) -> Vector3<f64> {
-        self.motion().velocity
+        Motion::turning(&self.ways()).velocity
+    }
+}
+
+impl Motion {
+    fn turning(ways: &[Vector3<f64>; 4]) -> Self {
+        let (velocity, acceleration) = motion(ways[0], ways[1]);
+        Self {
+            velocity,
+            acceleration,
+            onset: ONSET_RAD_S,
+            reach: REACH_RAD,
+        }
     }
 }
 
@@ -130,15 +140,11 @@ impl TurnModel {
         })
     }
 
-    /// Predicts from `state`, blended with constant angular velocity where the motion is new.
+    /// Predicts from `state`, by the other experts where the motion is new.
     ///
     /// A pure function; allocates nothing.
     pub fn forecast(&self, state: &TurnState, params: &Params) -> TurnForecast {
-        TurnForecast {
-            t: state.t,
-            q: state.q,
-            ahead: Ahead::blended(&self.model, &self.posterior(state), &state.motion(), params),
-        }
+        TurnForecast::fused(state, &TurnForecast::experts(state, Some(self)), params)
     }
 }
 
@@ -165,13 +171,28 @@ pub struct TurnPrediction {
 }
 
 impl TurnForecast {
-    /// Damped constant angular velocity alone: the prediction where no model is there.
-    pub fn constant_velocity(state: &TurnState, params: &Params) -> Self {
+    /// What each expert says: without a model only turning straight on (and holding).
+    pub fn experts(state: &TurnState, model: Option<&TurnModel>) -> Experts {
+        let ways = state.ways();
+        let motion = Motion::turning(&ways);
+        match model {
+            Some(turn) => Experts::all(&turn.model, &turn.posterior(state), &ways, &motion),
+            None => Experts::straight(&motion),
+        }
+    }
+
+    /// Their answers, fused: what both ends predict. A pure function; allocates nothing.
+    pub fn fused(state: &TurnState, experts: &Experts, params: &Params) -> Self {
         Self {
             t: state.t,
             q: state.q,
-            ahead: Ahead::straight(&state.motion(), params),
+            ahead: Ahead::fused(experts, params),
         }
+    }
+
+    /// Turning straight on or holding: the prediction where no model is there.
+    pub fn constant_velocity(state: &TurnState, params: &Params) -> Self {
+        Self::fused(state, &Self::experts(state, None), params)
     }
 
     /// The orientation `h_s` seconds after `t`; outside the knots as [`Ahead::at`].
@@ -226,12 +247,10 @@ mod tests {
             assert!((pose::between(m, &state.q) - rate * tau_s).norm() < 1e-6);
         }
         assert!((state.angular_velocity() - rate).norm() < 1e-6);
-        let undamped = Params {
-            cv_damping: 1.0,
-            ..Params::DEFAULT
-        };
-        let ahead = TurnForecast::constant_velocity(&state, &undamped).at(0.2);
-        let wanted = pose::moved(&state.q, &(rate * 0.2));
+        let straight = Params::only([0.0, 0.0, 1.0]);
+        let ahead = TurnForecast::constant_velocity(&state, &straight).at(0.2);
+        let way = rate * 0.2;
+        let wanted = pose::moved(&state.q, &(way / (1.0 + way.norm_squared()).sqrt()));
         assert!(ahead.orientation.angle_to(&wanted) < 1e-6);
     }
 

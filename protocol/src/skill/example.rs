@@ -8,7 +8,8 @@ use super::{
 };
 use crate::pose;
 use crate::predict::{
-    BLOCK, Calibration, FEATURES, MAX_KNOTS, Model, Regression, Standardisation, TARGETS, TurnModel,
+    BLOCK, Calibration, FEATURES, Generic, MAX_KNOTS, Model, Regression, Standardisation, TARGETS,
+    TurnModel,
 };
 
 /// A skill of `k` components whose predictor has `knots` knots: valid, repeatable, and learned from nothing.
@@ -102,6 +103,19 @@ fn example_parts(k: usize, knots: usize) -> Parts {
     }
 }
 
+fn example_generic(knots: usize) -> Generic {
+    let mut lead = [[0.0; MAX_KNOTS]; 4];
+    for (i, row) in lead.iter_mut().enumerate() {
+        for (j, v) in row[..knots].iter_mut().enumerate() {
+            *v = 0.1 * (j + 1) as f64 / (i + 1) as f64;
+        }
+    }
+    Generic {
+        lead,
+        products: [0.004, 0.009, 0.02, 0.015, 0.04, 0.08, 0.02, 0.05, 0.1, 0.15],
+    }
+}
+
 pub(super) fn example_model(k: usize, knots: usize) -> Model {
     let component = |i: usize| {
         let u = i as f64 / k as f64;
@@ -132,6 +146,7 @@ pub(super) fn example_model(k: usize, knots: usize) -> Model {
             scale: SVector::from_fn(|j, _| 0.05 + 0.01 * (j / 3) as f64),
         },
         (0..k).map(component).collect(),
+        example_generic(knots),
         Calibration::UNTRIED,
     )
     .expect("a valid example")

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::SkillError;
 use super::bytes::triangle;
 use crate::predict::{
-    BLOCK, Calibration, FEATURES, MAX_KNOTS, Model, ModelError, Params, Regression,
+    BLOCK, Calibration, FEATURES, Generic, MAX_KNOTS, Model, ModelError, Regression,
     Standardisation, TARGETS,
 };
 use crate::wire::codec::DecodeError;
@@ -40,9 +40,12 @@ pub(super) struct RawModel {
     scale: [f32; FEATURES],
     /// One factor a knot: its length is the number of knots.
     covariance: Vec<f32>,
-    straight_m2: Vec<f32>,
+    /// Of each expert, mixture first.
+    errors: Vec<[f32; 4]>,
     novelty90: f32,
-    params: [f32; 3],
+    /// Factors of the generic extrapolator, one a memory.
+    lead: Vec<[f32; 4]>,
+    products: [f32; 10],
     /// log₂ of the step of displacements at each knot.
     exponents: Vec<i8>,
     components: Vec<RawRegression>,
@@ -67,8 +70,6 @@ impl RawModel {
     pub(super) fn pack(model: &Model) -> Self {
         let knots = model.knots();
         let calibration = model.calibration();
-        let params = calibration.params;
-        let narrow = |v: &[f64]| v.iter().map(|&v| v as f32).collect::<Vec<_>>();
         let exponents = model
             .exponents()
             .map_or_else(|| exponents(model), |known| known[..knots].to_vec());
@@ -108,10 +109,19 @@ impl RawModel {
         Self {
             mean: model.standardisation().mean.map(|v| v as f32).into(),
             scale: model.standardisation().scale.map(|v| v as f32).into(),
-            covariance: narrow(&calibration.covariance[..knots]),
-            straight_m2: narrow(&calibration.straight_m2[..knots]),
+            covariance: calibration.covariance[..knots]
+                .iter()
+                .map(|&v| v as f32)
+                .collect(),
+            errors: calibration.errors[..knots]
+                .iter()
+                .map(|e| e.map(|v| v as f32))
+                .collect(),
             novelty90: calibration.novelty90 as f32,
-            params: [params.gain, params.trust, params.cv_damping].map(|v| v as f32),
+            lead: (0..knots)
+                .map(|j| model.generic().lead.map(|g| g[j] as f32))
+                .collect(),
+            products: model.generic().products.map(|v| v as f32),
             components: model.components().iter().map(regression).collect(),
             exponents,
         }
@@ -122,8 +132,11 @@ impl RawModel {
         if !(1..=MAX_KNOTS).contains(&knots) {
             return Err(ModelError::Knots { found: knots }.into());
         }
-        if self.straight_m2.len() != knots {
-            return Err(wrong_length("straight").into());
+        if self.errors.len() != knots {
+            return Err(wrong_length("errors").into());
+        }
+        if self.lead.len() != knots {
+            return Err(wrong_length("lead").into());
         }
         if self.exponents.len() != knots {
             return Err(wrong_length("exponents").into());
@@ -135,19 +148,22 @@ impl RawModel {
             }
             .into());
         }
-        let [gain, trust, cv_damping] = self.params.map(f64::from);
         let mut calibration = Calibration {
             covariance: [1.0; MAX_KNOTS],
-            straight_m2: [1.0; MAX_KNOTS],
+            errors: [[1.0; 4]; MAX_KNOTS],
             novelty90: f64::from(self.novelty90),
-            params: Params {
-                gain,
-                trust,
-                cv_damping,
-            },
         };
-        widen(&mut calibration.covariance, &self.covariance);
-        widen(&mut calibration.straight_m2, &self.straight_m2);
+        let mut generic = Generic {
+            lead: [[0.0; MAX_KNOTS]; 4],
+            products: self.products.map(f64::from),
+        };
+        for j in 0..knots {
+            calibration.covariance[j] = f64::from(self.covariance[j]);
+            calibration.errors[j] = self.errors[j].map(f64::from);
+            for (row, &v) in generic.lead.iter_mut().zip(&self.lead[j]) {
+                row[j] = f64::from(v);
+            }
+        }
         let components = self
             .components
             .iter()
@@ -162,6 +178,7 @@ impl RawModel {
                 scale: SVector::from(self.scale.map(f64::from)),
             },
             components,
+            generic,
             calibration,
         )?;
         Ok(model.in_steps(exponents))
@@ -273,11 +290,5 @@ fn wrong_length(field: &'static str) -> DecodeError {
     DecodeError::Invalid {
         field,
         why: "its length does not fit the number of knots",
-    }
-}
-
-fn widen(to: &mut [f64], from: &[f32]) {
-    for (to, &from) in to.iter_mut().zip(from) {
-        *to = f64::from(from);
     }
 }

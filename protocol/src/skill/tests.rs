@@ -129,7 +129,7 @@ fn a_model_with_a_bad_number_is_refused() {
         let (mut s, mut c) = (good.standardisation().clone(), good.components().to_vec());
         let mut calibration = *good.calibration();
         f(&mut s, &mut c, &mut calibration);
-        Model::new(3, s, c, calibration).unwrap_err()
+        Model::new(3, s, c, *good.generic(), calibration).unwrap_err()
     };
     use ModelError as E;
     assert!(matches!(
@@ -165,12 +165,18 @@ fn a_model_with_a_bad_number_is_refused() {
         E::NotPositive { .. }
     ));
     assert!(matches!(
-        spoil(|_, _, c| c.params.trust = 1.1),
-        E::Params(_)
+        spoil(|_, _, c| c.errors[1][2] = -1.0),
+        E::NotPositive { .. }
     ));
     let (s, c) = (good.standardisation().clone(), good.components().to_vec());
+    let mut generic = *good.generic();
+    generic.products[5] = 0.0;
     assert!(matches!(
-        Model::new(25, s, c, *good.calibration()),
+        Model::new(3, s.clone(), c.clone(), generic, *good.calibration()),
+        Err(E::NotPositive { .. })
+    ));
+    assert!(matches!(
+        Model::new(25, s, c, *good.generic(), *good.calibration()),
         Err(E::Knots { found: 25 })
     ));
 }

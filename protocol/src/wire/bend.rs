@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::codec::DecodeError;
 use super::state::{MAX_POSITION_M, POSITION_STEP_M, WireState};
-use crate::predict::{Bend, Forecast, Held, MAX_RATE, Params};
+use crate::predict::{Bend, Forecast, HandState, Held, MAX_RATE, Params};
 
 /// Steps of a rate of 1.
 const RATE_STEPS: f64 = 128.0;
@@ -39,8 +39,8 @@ pub struct WireHeld {
     pub state: WireState,
     /// Prediction gain κ, in 1/255.
     pub gain: u8,
-    /// Factor on the displacement's velocity, in 1/255.
-    pub damping: u8,
+    /// Weight of the straight line against holding, in 1/255.
+    pub straight: u8,
     /// The weight's lower triangle, row by row, in 1/127.
     pub weight: [i8; 6],
 }
@@ -102,8 +102,9 @@ impl WireHeld {
     ///
     /// Of `weight` only the lower triangle counts; it is symmetric, between 0 and 1.
     pub fn quantise(
-        state: &crate::predict::HandState,
-        params: &Params,
+        state: &HandState,
+        gain: f64,
+        straight: f64,
         weight: &Matrix3<f64>,
     ) -> Option<Self> {
         let byte = |v: f64| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
@@ -112,8 +113,8 @@ impl WireHeld {
             |i: usize, j: usize| (weight[(i, j)].clamp(-0.5, 0.5) * WEIGHT_STEPS).round() as i8;
         Some(Self {
             state: WireState::quantise(state)?,
-            gain: byte(params.gain),
-            damping: byte(params.cv_damping),
+            gain: byte(gain),
+            straight: byte(straight),
             weight: [
                 on(0),
                 beside(1, 0),
@@ -128,8 +129,7 @@ impl WireHeld {
     fn dequantise(&self) -> Held {
         let params = Params {
             gain: f64::from(self.gain) / 255.0,
-            trust: 0.0,
-            cv_damping: f64::from(self.damping) / 255.0,
+            ..Params::only([0.0, 0.0, f64::from(self.straight) / 255.0])
         };
         let [xx, yx, yy, zx, zy, zz] = self.weight.map(|n| f64::from(n) / WEIGHT_STEPS);
         Held {
@@ -155,7 +155,6 @@ impl WireHeld {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::predict::HandState;
     use crate::time::Stamp;
 
     #[test]
@@ -179,7 +178,7 @@ mod tests {
         let weight = turn * Matrix3::from_diagonal(&Vector3::new(1.0, 0.0, 0.4)) * turn.transpose();
         let mut state = HandState::first(Stamp(0), Vector3::zeros());
         state.advance(Stamp(33_000_000), Vector3::new(0.01, -0.02, 0.03));
-        let held = WireHeld::quantise(&state, &Params::DEFAULT, &weight).unwrap();
+        let held = WireHeld::quantise(&state, 1.0, 0.5, &weight).unwrap();
         assert_eq!(held.check(), Ok(()));
         assert!((held.dequantise().weight - weight).amax() <= 0.5 / WEIGHT_STEPS + 1e-12);
         for i in 0..6 {

@@ -6,6 +6,7 @@ pub mod codec;
 pub mod frame;
 pub mod hello;
 pub mod knots;
+mod params;
 pub mod state;
 pub mod turn;
 pub mod v1;

@@ -129,6 +129,7 @@ impl WirePose {
                 why: "above 10",
             });
         }
+        turn.params.check("pose.params")?;
         turn.q.check("pose.q")
     }
 }
@@ -166,7 +167,7 @@ mod tests {
             memory in prop::array::uniform4(rotation()),
         ) {
             let state = TurnState { t: Stamp(7), q, memory };
-            let params = WireParams { gain: 255, trust: 100, cv_damping: 0 };
+            let params = WireParams { gain: 255, inflation: 128, weights: [[100, 0, 155]; 3] };
             let wire = WireTurn::quantise(&state, params);
             let pose = WirePose { turn: Some(wire), grip: None };
             prop_assert!(pose.check().is_ok());
@@ -202,8 +203,8 @@ mod tests {
                 memory: [[0; 3]; 4],
                 params: WireParams {
                     gain: 0,
-                    trust: 0,
-                    cv_damping: 0,
+                    inflation: 0,
+                    weights: [[0; 3]; 3],
                 },
             }),
             grip: None,

@@ -9,9 +9,9 @@ use super::bend::WireBend;
 use super::codec::{self, DecodeError};
 use super::frame::MAX_FRAME_LEN;
 use super::knots::KnotBlock;
+pub use super::params::WireParams;
 use super::state::WireState;
 use super::turn::{WirePose, WireRotation};
-use crate::predict::Params;
 
 /// The version this module speaks.
 pub const VERSION: u16 = 1;
@@ -329,39 +329,6 @@ pub struct Motion {
     pub knots: KnotBlock,
 }
 
-/// `predict::Params` in steps of 1/255.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct WireParams {
-    /// Prediction gain κ.
-    pub gain: u8,
-    /// Weight of the mixture against constant velocity.
-    pub trust: u8,
-    /// Factor on the constant velocity.
-    pub cv_damping: u8,
-}
-
-impl WireParams {
-    /// The nearest parameters that can travel.
-    pub fn quantise(params: &Params) -> Self {
-        let step = |v: f64| (v * 255.0).round() as u8;
-        Self {
-            gain: step(params.gain),
-            trust: step(params.trust),
-            cv_damping: step(params.cv_damping),
-        }
-    }
-
-    /// The parameters both ends use.
-    pub fn dequantise(self) -> Params {
-        let value = |v: u8| f64::from(v) / 255.0;
-        Params {
-            gain: value(self.gain),
-            trust: value(self.trust),
-            cv_damping: value(self.cv_damping),
-        }
-    }
-}
-
 /// Knots of the path that ride on the control stream.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PathTail {
@@ -507,8 +474,14 @@ impl OperatorControl {
                     "outside 1 to 1000000",
                 )?;
                 match &engage.drive {
-                    Drive::Mirror { state, pose, .. } => {
+                    Drive::Mirror {
+                        state,
+                        params,
+                        pose,
+                        ..
+                    } => {
                         state.check()?;
+                        params.check("engage.params")?;
                         pose.check()
                     }
                     Drive::Play { .. } => Ok(()),
@@ -567,6 +540,7 @@ impl OperatorDatagram {
             Self::Motion(motion) => {
                 motion.knots.check("motion.knots", MAX_KNOTS)?;
                 motion.state.check()?;
+                motion.params.check("motion.params")?;
                 motion.pose.check()
             }
             Self::Go { bend, .. } => bend.as_ref().map_or(Ok(()), WireBend::check),

@@ -26,11 +26,7 @@ const EPOCH: u32 = 41;
 /// The session clock reads this much more than the robot's, ns.
 const OFFSET: i64 = -7_000_000_000_000;
 
-const STEADY: Params = Params {
-    gain: 1.0,
-    trust: 1.0,
-    cv_damping: 0.5,
-};
+const STEADY: Params = Params::DEFAULT;
 
 /// A session, the robot's clock, and what the session has said so far.
 struct Bench {

@@ -5,8 +5,8 @@ use std::borrow::Cow;
 use nalgebra::{SVector, UnitQuaternion, Vector3};
 use telemime_protocol::pose;
 use telemime_protocol::predict::{
-    Calibration, FEATURES, HandState, KNOT_SPACING_S, Model, ModelError, Posterior, Regression,
-    Standardisation, TurnModel, TurnState,
+    Calibration, Experts, FEATURES, Forecast, Generic, HandState, KNOT_SPACING_S, Model,
+    ModelError, Posterior, Regression, Standardisation, TurnForecast, TurnModel, TurnState,
 };
 use telemime_protocol::time::Stamp;
 
@@ -20,6 +20,7 @@ pub(in crate::learn) struct Fitted {
     pub(super) components: Vec<Regression>,
     /// Where each component takes its absolute feature about, if it does.
     pub(super) charts: Vec<UnitQuaternion<f64>>,
+    pub(super) generic: Generic,
 }
 
 /// A side of a demonstration that can be predicted: displacements are vectors, whatever the space.
@@ -48,8 +49,8 @@ pub(in crate::learn) trait Course {
     fn seen<'a>(rows: &'a [Row], chart: Option<&UnitQuaternion<f64>>, scale: f64)
     -> Cow<'a, [Row]>;
 
-    /// The velocity (m/s, rad/s) that the state implies.
-    fn velocity(state: &Self::State) -> Vector3<f64>;
+    /// What each expert says; without a model only those that need none.
+    fn experts(model: Option<&Self::Model>, state: &Self::State) -> Experts;
 
     /// The mixture's answer.
     fn posterior(model: &Self::Model, state: &Self::State) -> Posterior;
@@ -66,6 +67,7 @@ fn model(fitted: &Fitted, calibration: Calibration) -> Result<Model, ModelError>
         fitted.knots,
         fitted.standardisation.clone(),
         fitted.components.clone(),
+        fitted.generic,
         calibration,
     )
 }
@@ -101,8 +103,8 @@ impl Course for Places {
         Cow::Borrowed(rows)
     }
 
-    fn velocity(state: &HandState) -> Vector3<f64> {
-        state.motion().0
+    fn experts(model: Option<&Model>, state: &HandState) -> Experts {
+        Forecast::experts(state, model)
     }
 
     fn posterior(model: &Model, state: &HandState) -> Posterior {
@@ -187,8 +189,8 @@ impl Course for Turns {
         Cow::Owned(rows.iter().map(about).collect())
     }
 
-    fn velocity(state: &TurnState) -> Vector3<f64> {
-        state.angular_velocity()
+    fn experts(model: Option<&TurnModel>, state: &TurnState) -> Experts {
+        TurnForecast::experts(state, model)
     }
 
     fn posterior(model: &TurnModel, state: &TurnState) -> Posterior {

@@ -2,6 +2,7 @@
 
 mod blocks;
 mod course;
+mod generic;
 mod refine;
 
 use nalgebra::{SVector, UnitQuaternion, Vector3};
@@ -21,6 +22,7 @@ use super::{LearnError, Progress};
 use crate::demonstration::Demonstration;
 use course::Fitted;
 pub(super) use course::{Course, Places, Turns};
+use generic::Products;
 pub(super) use refine::refine;
 
 /// Dimension of the joint that EM sees: the features and three displacements.
@@ -313,6 +315,7 @@ fn fit<C: Course>(
     if !charts.is_empty() {
         features.mean.fixed_rows_mut::<3>(0).fill(0.0);
     }
+    let generic = Products::of(rows.iter().copied()).solve()?;
     let seen = |k: usize| C::seen(&scaled, charts.get(k), features.scale[0]);
     let components = blocks::regressions(seen, &shares, stride, &scaling, &em_options)?;
     Ok(Fitted {
@@ -320,6 +323,7 @@ fn fit<C: Course>(
         standardisation: features,
         components,
         charts,
+        generic,
     })
 }
 

@@ -4,6 +4,7 @@ use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 use telemime_protocol::predict::{Calibration, FEATURES, MAX_KNOTS, Regression, TARGETS};
 
 use super::blocks::{self, Blocks};
+use super::generic::Products;
 use super::{
     Course, EM_KNOTS, Fitted, PredictorOptions, Row, Scaling, em_options, rows_of, scale_row,
 };
@@ -45,10 +46,10 @@ pub(in crate::learn) fn refine<C: Course>(
         target_mean: [0.0; TARGETS],
         target_scale: [1.0; TARGETS],
     };
-    let new: Vec<Row> = rows_of::<C>(d, inner.knots(), &UnitQuaternion::identity())
-        .iter()
-        .map(|row| scale_row(row, &scaling))
-        .collect();
+    let taken = rows_of::<C>(d, inner.knots(), &UnitQuaternion::identity());
+    let mut products = Products::recovered(inner.generic(), rows);
+    products.join(&Products::of(taken.iter()));
+    let new: Vec<Row> = taken.iter().map(|row| scale_row(row, &scaling)).collect();
     let seen = |k: usize| C::seen(&new, charts.get(k), features.scale[0]);
     let old = blocks::recovered(inner.components(), rows, &options);
     let knots = EM_KNOTS.map(|knot| knot.min(inner.knots()) - 1);
@@ -79,6 +80,7 @@ pub(in crate::learn) fn refine<C: Course>(
         standardisation: features,
         components,
         charts: charts.to_vec(),
+        generic: products.solve()?,
     };
     Ok(Refined {
         model: C::model(&fitted, calibration)?,
@@ -152,11 +154,12 @@ fn blend(old: &Calibration, new: &Calibration, before: usize) -> Calibration {
     let mut out = *old;
     for j in 0..MAX_KNOTS {
         out.covariance[j] = factor(old.covariance[j], new.covariance[j]);
-        out.straight_m2[j] += (new.straight_m2[j] - old.straight_m2[j]) * share;
+        let pairs = out.errors[j].iter_mut().zip(&new.errors[j]);
+        for ((old, new), share) in pairs.zip([tried, tried, share, share]) {
+            *old += (new - *old) * share;
+        }
     }
     out.novelty90 = factor(old.novelty90, new.novelty90);
-    out.params.trust += (new.params.trust - old.params.trust) * tried;
-    out.params.cv_damping += (new.params.cv_damping - old.params.cv_damping) * share;
     out
 }
 
@@ -254,10 +257,15 @@ mod tests {
         let mut seen = guess;
         seen.covariance = [0.5; MAX_KNOTS];
         seen.novelty90 = 1e6;
-        seen.params.trust = 0.4;
-        assert_eq!(blend(&guess, &seen, 1).covariance[3], 0.5);
+        seen.errors = [[0.4; 4]; MAX_KNOTS];
+        let first = blend(&guess, &seen, 1);
+        assert_eq!(first.covariance[3], 0.5);
+        // What needs no model was seen before: guesses only of the others.
+        assert_eq!(first.errors[3][..2], [0.4; 2]);
+        let half = 0.5 * (guess.errors[3][3] + 0.4);
+        assert!((first.errors[3][3] - half).abs() < 1e-12);
         let later = blend(&guess, &seen, 3);
-        assert!((later.params.trust - (0.75 * guess.params.trust + 0.1)).abs() < 1e-12);
+        assert!((later.errors[3][0] - (0.75 * guess.errors[3][0] + 0.1)).abs() < 1e-12);
         // A demonstration of something else does not make everything familiar.
         assert!(later.novelty90 <= guess.novelty90 * 1.75 + 1e-9);
     }

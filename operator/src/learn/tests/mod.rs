@@ -410,8 +410,7 @@ fn a_skill_is_learned_and_the_same_seed_gives_the_same_bytes() {
     for state in states(&unseen) {
         let t_s = state.t.as_secs_f64() + 0.2;
         if t_s < unseen.duration_s() {
-            let params = skill.predictor().calibration().params;
-            let f: Forecast = skill.predictor().forecast(&state, &params);
+            let f: Forecast = skill.predictor().forecast(&state, &Params::DEFAULT);
             let truth = unseen.position_at(t_s);
             error += (f.at(0.2).position - truth).norm_squared();
             moved += (state.x - truth).norm_squared();

@@ -8,6 +8,7 @@
 mod decoder;
 mod encoder;
 mod packed;
+mod reach;
 
 pub use decoder::PathDecoder;
 pub use encoder::PathEncoder;
@@ -31,7 +32,7 @@ pub const MAX_GAP_S: f64 = 0.5;
 const MAX_STEPS: i32 = 1 << 30;
 
 /// Tangents are in units of this many steps of their coordinate a second.
-const SLOPE_STEPS: i32 = 8;
+const SLOPE_STEPS: f64 = 8.0;
 
 /// What [`PathGrid::slope_shift`] is at the start of a piece.
 const START_SHIFT: u32 = 1;
@@ -86,42 +87,54 @@ pub enum PathError {
 }
 
 /// The steps of positions and tangents, derived from the bound by both ends.
+///
+/// The coordinates form one group, or two with a bound each: a place in metres, say, and an orientation in ℝ⁴.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PathGrid<const D: usize = 3> {
-    step: f64,
+    /// The first coordinate of the second group; D if there is none.
+    second: usize,
+    steps: [f64; 2],
 }
 
 impl<const D: usize> PathGrid<D> {
-    /// The grid for `bound_m`: positions in steps of half the bound, tangents in units of four bounds a second.
+    /// The grid for `bound_m` on the distance: positions in steps of half the bound, tangents in units of four
+    /// bounds a second.
     ///
     /// # Errors
     /// [`CheckpointError::Bound`], [`CheckpointError::BoundTooFine`].
     pub fn for_bound(bound_m: f64) -> Result<Self, CheckpointError> {
-        const LEAST_M: f64 = 2e-9;
-        let largest_m = f64::from(u32::MAX) * LEAST_M;
-        if !(bound_m > 0.0 && bound_m <= largest_m) {
-            return Err(CheckpointError::Bound { bound_m, largest_m });
-        }
-        // Whole nanometres; one part in 10⁹ of slack, so that 2 nm is 1 step and not 0.999….
-        match (bound_m / LEAST_M * (1.0 + 1e-9)) as u32 {
-            0 => Err(CheckpointError::BoundTooFine {
-                bound_m,
-                least_m: LEAST_M,
-            }),
-            nm => Ok(Self {
-                step: f64::from(nm) * 1e-9,
-            }),
-        }
+        let step = step_for(bound_m)?;
+        Ok(Self {
+            second: D,
+            steps: [step; 2],
+        })
     }
 
-    /// Step of the positions, m.
+    /// The same for coordinates in two groups, the second of which begins at `second`, each with a bound on its
+    /// own distance.
+    ///
+    /// # Errors
+    /// As [`PathGrid::for_bound`].
+    pub fn for_bounds(second: usize, bounds: [f64; 2]) -> Result<Self, CheckpointError> {
+        Ok(Self {
+            second: second.min(D),
+            steps: [step_for(bounds[0])?, step_for(bounds[1])?],
+        })
+    }
+
+    /// Step of the positions (of the first group), m.
     pub fn step_m(self) -> f64 {
-        self.step
+        self.steps[0]
     }
 
-    /// Unit of the tangents, m/s.
+    /// Unit of the tangents (of the first group), m/s.
     pub fn slope_step_mps(self) -> f64 {
-        self.step * f64::from(SLOPE_STEPS)
+        self.step_m() * SLOPE_STEPS
+    }
+
+    /// Step of each coordinate.
+    fn step(self) -> SVector<f64, D> {
+        SVector::from_fn(|d, _| self.steps[usize::from(d >= self.second)])
     }
 
     /// At the end of a span of so many ticks, tangents are multiples of two to this: half of that moves no
@@ -153,7 +166,11 @@ impl<const D: usize> PathGrid<D> {
         });
         let multiple = f64::from(1_u32 << shift);
         let limit = f64::from(MAX_STEPS);
-        let (x, v) = (x / self.step, v / (self.slope_step_mps() * multiple));
+        let step = self.step();
+        let (x, v) = (
+            x.component_div(&step),
+            v.component_div(&(step * SLOPE_STEPS * multiple)),
+        );
         if x.iter().any(|c| c.abs() > limit) {
             return Err(PathError::OutOfRange);
         }
@@ -177,11 +194,28 @@ impl<const D: usize> PathGrid<D> {
         match ns {
             Some(ns) if in_range => Ok(DecodedKnot {
                 t: Stamp(ns),
-                x: SVector::from(knot.x.map(f64::from)) * self.step,
-                v: SVector::from(knot.v.map(f64::from)) * self.slope_step_mps(),
+                x: SVector::from(knot.x.map(f64::from)).component_mul(&self.step()),
+                v: SVector::from(knot.v.map(f64::from)).component_mul(&(self.step() * SLOPE_STEPS)),
             }),
             _ => Err(PathError::OutOfRange),
         }
+    }
+}
+
+/// Half of `bound`, in whole nanometres (or 10⁻⁹).
+fn step_for(bound_m: f64) -> Result<f64, CheckpointError> {
+    const LEAST_M: f64 = 2e-9;
+    let largest_m = f64::from(u32::MAX) * LEAST_M;
+    if !(bound_m > 0.0 && bound_m <= largest_m) {
+        return Err(CheckpointError::Bound { bound_m, largest_m });
+    }
+    // One part in 10⁹ of slack, so that 2 nm is 1 step and not 0.999….
+    match (bound_m / LEAST_M * (1.0 + 1e-9)) as u32 {
+        0 => Err(CheckpointError::BoundTooFine {
+            bound_m,
+            least_m: LEAST_M,
+        }),
+        nm => Ok(f64::from(nm) * 1e-9),
     }
 }
 

@@ -4,10 +4,12 @@ use nalgebra::SVector;
 
 use super::super::plan::MAX_STEPS;
 use super::super::{CheckpointError, Grid, MAX_POINTS, Plan, check_series};
+use super::Effort;
 use super::search::{Motion, Search};
 
-/// Sample evaluations spent on moving points.
+/// Sample evaluations spent on moving points, by [`Effort::Thorough`] and by the others.
 const EFFORT: usize = 1 << 23;
+const BRISK_EFFORT: usize = 12_000;
 
 /// Steps of the plan are this share of the error of the curve that is not quantised.
 const STEP: f64 = 0.5;
@@ -26,6 +28,19 @@ pub fn counted<const D: usize>(
     y: &[SVector<f64, D>],
     count: usize,
 ) -> Result<Plan<D>, CheckpointError> {
+    counted_with(t, y, count, Effort::Thorough)
+}
+
+/// As [`counted`], with so much effort; all but [`Effort::Thorough`] are one here.
+///
+/// # Errors
+/// As [`counted`].
+pub fn counted_with<const D: usize>(
+    t: &[f64],
+    y: &[SVector<f64, D>],
+    count: usize,
+    effort: Effort,
+) -> Result<Plan<D>, CheckpointError> {
     check_series(t, y)?;
     if count < 2 {
         return Err(CheckpointError::TooFew { count, least: 2 });
@@ -36,11 +51,17 @@ pub fn counted<const D: usize>(
     let motion = Motion::new(t, y);
     let any = Grid::for_bound(1.0)?.with_fine_ticks().with_ticks_of(t);
     let mut search = Search::new(&motion, any);
-    let starts = [inserted(&mut search, count), search.shares(count)];
+    let thorough = effort == Effort::Thorough;
+    let effort = if thorough { EFFORT } else { BRISK_EFFORT };
+    let mut starts = vec![search.shares(count)];
+    // One fit a point: more than all there is to spend, for many.
+    if thorough || 2 * count * t.len() < BRISK_EFFORT / 2 {
+        starts.insert(0, inserted(&mut search, count));
+    }
     let mut best = (f64::INFINITY, Vec::new());
     for mut kept in starts {
         search.effort = 0;
-        let sum = improve(&mut search, &mut kept);
+        let sum = improve(&mut search, &mut kept, effort);
         if kept.len() <= count && sum < best.0 {
             best = (sum, kept);
         }
@@ -75,12 +96,16 @@ fn inserted<const D: usize>(search: &mut Search<'_, D>, count: usize) -> Vec<usi
 }
 
 /// Moves and swaps points while that lowers the sum of squares, which it returns.
-fn improve<const D: usize>(search: &mut Search<'_, D>, kept: &mut Vec<usize>) -> f64 {
+fn improve<const D: usize>(
+    search: &mut Search<'_, D>,
+    kept: &mut Vec<usize>,
+    effort: usize,
+) -> f64 {
     let mut sum = search.squares(kept);
     loop {
         let before = sum;
         for j in 1..kept.len() - 1 {
-            if search.effort > EFFORT {
+            if search.effort > effort {
                 return sum;
             }
             for step in [-8, -4, -2, -1, 1, 2, 4, 8] {
@@ -104,14 +129,19 @@ fn improve<const D: usize>(search: &mut Search<'_, D>, kept: &mut Vec<usize>) ->
                 }
             }
         }
-        if !(sum < 0.999 * before) && !swap(search, kept, &mut sum) {
+        if !(sum < 0.999 * before) && !swap(search, kept, &mut sum, effort) {
             return sum;
         }
     }
 }
 
 /// Takes one point out and puts one in elsewhere, if some such pair lowers the sum of squares.
-fn swap<const D: usize>(search: &mut Search<'_, D>, kept: &mut Vec<usize>, sum: &mut f64) -> bool {
+fn swap<const D: usize>(
+    search: &mut Search<'_, D>,
+    kept: &mut Vec<usize>,
+    sum: &mut f64,
+    effort: usize,
+) -> bool {
     for j in 1..kept.len() - 1 {
         let mut without = kept.clone();
         without.remove(j);
@@ -134,7 +164,7 @@ fn swap<const D: usize>(search: &mut Search<'_, D>, kept: &mut Vec<usize>, sum: 
                 return true;
             }
         }
-        if search.effort > EFFORT {
+        if search.effort > effort {
             return false;
         }
     }

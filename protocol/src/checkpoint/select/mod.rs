@@ -7,5 +7,5 @@ mod publication;
 mod search;
 
 pub use bounded::{Effort, bounded, bounded_with};
-pub use counted::counted;
+pub use counted::{counted, counted_with};
 pub use publication::{gradient, publication};

@@ -245,7 +245,7 @@ fn bent(bench: &Bench, ms_ago: i64) -> WireBend {
         held: Some(WireHeld {
             state: WireState::quantise(&state).unwrap(),
             gain: 255,
-            damping: 128,
+            straight: 128,
             weight: [127, 0, 64, 0, 0, 0],
         }),
     }
