@@ -58,7 +58,7 @@ impl WireBend {
         held: Option<WireHeld>,
     ) -> Option<Self> {
         let within = |v: &f64| v.abs() <= MAX_POSITION_M;
-        if !left.iter().all(within) || !(at_s.is_finite() && ahead_s.is_finite()) {
+        if !(left.iter().all(within) && at_s.is_finite() && ahead_s.is_finite()) {
             return None;
         }
         let rate = (rate.clamp(0.0, MAX_RATE) * RATE_STEPS).round() as u8;
