@@ -22,8 +22,9 @@ use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Mono,
 use tokio::sync::mpsc;
 
 use crate::daemon::{Daemon, Learning};
-use crate::placed::Placed;
-use crate::session::{FutureBound, SessionConfig};
+use crate::demonstration::{Demonstration, Sample};
+use crate::placed::{Motion, Placed};
+use crate::session::{FutureBound, Leeway, SessionConfig};
 use crate::task::{Outcome, Recording, Task};
 pub use infer::{Bounds, infer};
 pub use pair::{PairArgs, pair};
@@ -87,6 +88,15 @@ pub struct Args {
         conflicts_with = "replay"
     )]
     pub frame: Vec<Placed>,
+    /// Play: a hand corrects the motion; a recording (CSV: t,x,y,z) whose times count from when the robot begins. Where
+    /// it has samples the hand holds on, and moving it bends the motion; where it has none for more than 0.25 s the hand
+    /// has let go, and the skill goes on.
+    #[arg(long, value_name = "FILE", conflicts_with = "replay")]
+    pub correct: Option<PathBuf>,
+    /// How exactly the hand means its corrections, m: against the skill's own deviation this decides how much they
+    /// bend it [default: 0.02].
+    #[arg(long, value_name = "M")]
+    pub hand_sigma: Option<f64>,
     /// Play: largest error of the rebuilt motion, m [default: 1 % of the skill's reach].
     #[arg(long, value_name = "M")]
     pub bound: Option<f64>,
@@ -259,6 +269,8 @@ struct File {
     play: Option<String>,
     #[serde(default)]
     frames: BTreeMap<String, Vec<f64>>,
+    correct: Option<PathBuf>,
+    hand_sigma_m: Option<f64>,
     bound_m: Option<f64>,
     turn_bound_rad: Option<f64>,
     scale: Option<f64>,
@@ -332,6 +344,10 @@ impl Args {
                 .collect::<Result<_, _>>()
                 .with_context(|| format!("{}: [frames]", path.display()))?;
         }
+        if self.play.is_some() {
+            self.correct = self.correct.or(file.correct);
+        }
+        self.hand_sigma = self.hand_sigma.or(file.hand_sigma_m);
         self.bound = self.bound.or(file.bound_m);
         self.turn_bound = self.turn_bound.or(file.turn_bound_rad);
         self.scale = self.scale.or(file.scale);
@@ -360,6 +376,7 @@ impl Args {
             input_latency_s: self.input_latency.unwrap_or(0.0),
             glitch_gate: self.glitch_gate,
             gain: self.gain.unwrap_or(defaults.gain),
+            hand_sigma_m: self.hand_sigma.unwrap_or(defaults.hand_sigma_m),
             scale: self.scale,
             rotation: self.axes.unwrap_or_default().rotation(),
             versions: telemime_endpoint::cli::versions(self.protocol_max)?,
@@ -380,6 +397,7 @@ impl Args {
             -f64::EPSILON,
             config.max_silence_s,
         )?;
+        within("--hand-sigma", config.hand_sigma_m, 0.0, 1.0)?;
         within("--gain", config.gain, -f64::EPSILON, 1.0)?;
         if let Some(scale) = config.scale {
             within("--scale", scale, 0.0, 10.0)?;
@@ -578,11 +596,36 @@ fn make_task(
             log.say(&Event::Plan(report));
             // Demonstrations that went elsewhere are no measure of a motion with its frames moved.
             let shown = skills.aligned(name).filter(|_| args.frame.is_empty());
-            let played = Played::new(plan.curve()?, shown, rotation);
-            Ok((Task::play(plan), Some(played)))
+            let curve = plan.curve()?;
+            let task = match &args.correct {
+                Some(path) => {
+                    let samples = correction(path, curve.end_s())?;
+                    let motion = Motion::new(&skill, &args.frame)?;
+                    let leeway = Leeway::of(&motion, skill.duration_s());
+                    Task::play_corrected(plan, leeway, samples)
+                }
+                None => Task::play(plan),
+            };
+            Ok((task, Some(Played::new(curve, shown, rotation))))
+        }
+        ([_, ..], _) if args.correct.is_some() => {
+            bail!("--correct bends a skill that is played; a replay is the hand itself")
         }
         _ => bail!("what to do? Give --replay FILE or --play SKILL"),
     }
+}
+
+/// The hand that corrects a play of `end_s`.
+fn correction(path: &Path, end_s: f64) -> anyhow::Result<Vec<Sample>> {
+    let recording = Demonstration::read_beside(path)?;
+    let first_s = recording.samples()[0].t_s;
+    if !(0.0..end_s).contains(&first_s) {
+        bail!(
+            "{}: the first sample is at {first_s:.2} s, but its times count from when the robot begins a motion of {end_s:.2} s",
+            path.display()
+        );
+    }
+    Ok(recording.samples().to_vec())
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ mod alignment;
 mod arms;
 mod codec;
 mod commands;
+mod correct;
 mod data;
 mod evaluate;
 mod floods;

@@ -15,6 +15,7 @@ use telemime_protocol::predict::{
 };
 use telemime_protocol::skill::{Gmm, Pace, Parts, Provenance, Samples, Skill, Source, Stats};
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::{self, Frame};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
@@ -53,6 +54,23 @@ const TURN: WireTurn = WireTurn {
         inflation: 128,
         weights: [[0, 0, 200]; 3],
     },
+};
+
+const BEND: WireBend = WireBend {
+    plan_us: 1_500_000,
+    rate: 64,
+    left: [200, 0, -50],
+    held: Some(WireHeld {
+        state: WireState {
+            t_us: 3_190_000,
+            x: [0, 800, -10],
+            memory_exponent: 3,
+            memory: [[0, 40, -1], [0, 90, -2], [1, 120, -4], [1, 125, -4]],
+        },
+        gain: 255,
+        straight: 128,
+        weight: [64, 10, 100, 0, -5, 127],
+    }),
 };
 
 const TIP_Q: WireRotation = WireRotation([7_869, -3_976, 0]);
@@ -378,6 +396,18 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
                 seq: 43,
                 t_us: 3_200_000,
                 lease_ms: 650,
+                bend: None,
+            }),
+        ),
+        (
+            "go-bend",
+            message(&OperatorDatagram::Go {
+                epoch: 7,
+                engagement: 2,
+                seq: 44,
+                t_us: 3_200_000,
+                lease_ms: 650,
+                bend: Some(BEND),
             }),
         ),
         (
@@ -521,6 +551,10 @@ fn values() -> BTreeMap<String, String> {
     say("plan x(0.1)", vector(&jet.x));
     say("plan v(0.1)", vector(&jet.v));
     say("plan a(0.1)", vector(&jet.a));
+
+    let bend = BEND.dequantise();
+    say("bend plan(3.4)", format!("{:.9}", bend.plan_at(0.2)));
+    say("bend offset(3.4)", vector(&bend.offset_at(0.2, 0.21)));
     values
 }
 

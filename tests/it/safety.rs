@@ -36,7 +36,7 @@ async fn full_speed(pair: &Pair) -> Mono {
 }
 
 /// The tip is where it was, at rest, for the last `span_s`, and nothing follows anything.
-fn assert_rested(pair: &Pair, span_s: f64) {
+pub(crate) fn assert_rested(pair: &Pair, span_s: f64) {
     let reports = pair.robot.reports();
     let last = reports.last().unwrap();
     let ticks = (span_s * 1e3) as usize;
@@ -56,7 +56,7 @@ fn following(r: &Report) -> bool {
 }
 
 /// Tip and joints never exceed what the arm is set to.
-fn assert_within_limits(pair: &Pair, rig: &Rig) {
+pub(crate) fn assert_within_limits(pair: &Pair, rig: &Rig) {
     let info = rig.info();
     let (mut fastest, mut hardest) = (0.0f64, 0.0f64);
     let reports = pair.robot.reports();

@@ -35,6 +35,8 @@ pub struct SessionConfig {
     pub glitch_gate: bool,
     /// Prediction gain κ in [0, 1].
     pub gain: f64,
+    /// How exactly the hand means its displacement when it corrects what is played, m: the smaller, the more it bends it.
+    pub hand_sigma_m: f64,
     /// Tip metres per hand metre; `None` derives it from the demonstrations and the arm's limits.
     pub scale: Option<f64>,
     /// Hand axes to the robot's base axes.
@@ -54,6 +56,7 @@ impl Default for SessionConfig {
             input_latency_s: 0.0,
             glitch_gate: false,
             gain: 1.0,
+            hand_sigma_m: 0.02,
             scale: None,
             rotation: UnitQuaternion::identity(),
             versions: Versions::default(),

@@ -5,6 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::bend::WireBend;
 use super::codec::{self, DecodeError};
 use super::frame::MAX_FRAME_LEN;
 use super::knots::KnotBlock;
@@ -282,6 +283,9 @@ pub enum OperatorDatagram {
         t_us: i64,
         /// For how long motion is authorised, ms.
         lease_ms: u16,
+        /// What the operator's hand makes of the plan, stated for `t_us`; without it the plan is played as it is, from
+        /// the instant of engaging.
+        bend: Option<WireBend>,
     },
     /// Answer to [`RobotDatagram::Ping`].
     Pong {
@@ -558,7 +562,8 @@ impl OperatorDatagram {
                 motion.params.check("motion.params")?;
                 motion.pose.check()
             }
-            Self::Go { .. } | Self::Pong { .. } | Self::Stop { .. } | Self::Clock { .. } => Ok(()),
+            Self::Go { bend, .. } => bend.as_ref().map_or(Ok(()), WireBend::check),
+            Self::Pong { .. } | Self::Stop { .. } | Self::Clock { .. } => Ok(()),
         }
     }
 }

@@ -249,7 +249,11 @@ impl Session {
                 seq,
                 t_us,
                 lease_ms,
-            }) => self.on_go(now, epoch, engagement, seq, t_us, lease_ms),
+                bend,
+            }) => {
+                let ours = epoch == self.epoch && engagement == self.engagement;
+                ours && self.on_go(now, seq, t_us, lease_ms, bend.as_ref())
+            }
             Ok(OperatorDatagram::Pong {
                 epoch,
                 t1_us,
