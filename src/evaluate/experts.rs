@@ -5,6 +5,7 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Vector1, Vector3};
 use telemime_operator::demonstration::{Demonstration, Sample};
 use telemime_operator::session::SessionConfig;
+use telemime_operator::session::adapt::Adaptation;
 use telemime_protocol::pose;
 use telemime_protocol::predict::{
     Ahead, Calibration, HandState, KNOT_SPACING_S, MAX_KNOTS, Posterior, TurnState,
@@ -80,7 +81,7 @@ pub(super) trait Expert {
 }
 
 /// Names, in the order of [`experts`].
-pub(super) const PLACE_NAMES: [&str; 8] = [
+pub(super) const PLACE_NAMES: [&str; 9] = [
     "hold",
     "constant velocity",
     "damped velocity ×0.5",
@@ -88,17 +89,19 @@ pub(super) const PLACE_NAMES: [&str; 8] = [
     "Kalman",
     "clock-indexed GMR",
     "mixture alone",
+    "guard, rest unseen",
     GUARDED,
 ];
 
 /// The same of orientations.
-pub(super) const TURN_NAMES: [&str; 7] = [
+pub(super) const TURN_NAMES: [&str; 8] = [
     "hold",
     "constant velocity",
     "damped velocity ×0.5",
     "generic",
     "clock-indexed GMR",
     "mixture alone",
+    "guard, rest unseen",
     GUARDED,
 ];
 
@@ -124,6 +127,7 @@ pub(super) fn experts(side: Side, skill: &Arc<Skill>, kalman: &Kalman) -> Vec<Bo
         hand: None,
         posterior: None,
     }));
+    all.push(Box::new(Unrested::new(side, skill)));
     all.push(Box::new(Guarded::new(side, skill)));
     all
 }
@@ -320,6 +324,69 @@ impl Expert for Mixture {
 
     fn novelty(&self) -> Option<f64> {
         Some(self.posterior.as_ref()?.novelty / self.calibration()?.novelty90)
+    }
+}
+
+/// The session's guard on a hand of which nobody says that it has rested: what it costs not to begin motion that
+/// the person has not begun.
+struct Unrested {
+    side: Side,
+    skill: Arc<Skill>,
+    hand: Option<Hand>,
+    places: Adaptation<HandState>,
+    turns: Adaptation<TurnState>,
+    ahead: Option<Ahead>,
+}
+
+impl Unrested {
+    fn new(side: Side, skill: &Arc<Skill>) -> Self {
+        let turns = skill
+            .turn()
+            .map(|turn| turn.predictor.model().calibration());
+        let places = skill.predictor().calibration();
+        Self {
+            side,
+            skill: Arc::clone(skill),
+            hand: None,
+            places: Adaptation::of_places(1.0, Some(places), skill.stats().reach_m),
+            turns: Adaptation::of_turns(1.0, turns),
+            ahead: None,
+        }
+    }
+}
+
+impl Expert for Unrested {
+    fn take(&mut self, sample: &Sample) {
+        let before = self.hand;
+        let hand = Hand::take(&mut self.hand, sample);
+        let turn = self.skill.turn().map(|turn| &turn.predictor);
+        self.ahead = match (self.side, turn, hand.turn) {
+            (Side::Place, ..) => {
+                let model = self.skill.predictor();
+                if let Some(before) = before {
+                    self.places.observe(&before.place, &hand.place, Some(model));
+                }
+                let params = self.places.params(&hand.place);
+                Some(model.forecast(&hand.place, &params).ahead)
+            }
+            (Side::Turn, Some(model), Some(state)) => {
+                if let Some(before) = before.and_then(|hand| hand.turn) {
+                    self.turns.observe(&before, &state, Some(model));
+                }
+                Some(model.forecast(&state, &self.turns.params(&state)).ahead)
+            }
+            _ => None,
+        };
+    }
+
+    fn ahead(&self, h_s: f64) -> Guess {
+        match &self.ahead {
+            Some(ahead) => Guess {
+                way: ahead.at(h_s).displacement,
+                spread: Some(covariance(ahead, h_s)),
+            },
+            None => Vector3::zeros().into(),
+        }
     }
 }
 
