@@ -59,6 +59,10 @@ impl Outcome {
 
 /// What the robot makes of a message.
 #[derive(Clone, Copy)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "one lives at a time, on the stack"
+)]
 enum Told {
     /// The hand was there, and may move on at this velocity (m/s).
     Straight(Stamp, Vector3<f64>, Vector3<f64>),
