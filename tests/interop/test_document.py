@@ -44,7 +44,7 @@ class Document(unittest.TestCase):
         kinds = {
             "operator control": "engage-mirror engage-play path reset",
             "robot control": "info engaged refused state",
-            "operator datagram": "motion motion-pose go pong stop",
+            "operator datagram": "motion motion-pose go pong stop clock",
             "robot datagram": "ping telemetry",
         }
         for kind, names in kinds.items():

@@ -97,6 +97,7 @@ OPERATOR_DATAGRAM = Enum(
     ("Go", Struct(("epoch", U32), ("engagement", U32), ("seq", U32), ("t_us", I64), ("lease_ms", U16))),
     ("Pong", Struct(("epoch", U32), ("t1_us", I64), ("t2_us", I64), ("t3_us", I64))),
     ("Stop", Struct(("epoch", U32))),
+    ("Clock", Struct(("epoch", U32), ("ahead_us", I64), ("dispersion_us", U32))),
 )  # fmt: skip
 ROBOT_DATAGRAM = Enum(
     ("Ping", Struct(("epoch", U32), ("t1_us", I64))),
