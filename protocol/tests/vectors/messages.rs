@@ -411,6 +411,7 @@ pub(crate) fn messages() -> Vec<Vector> {
             seq: draw.u32(),
             t_us: draw.signed(53),
             lease_ms: draw.u16(),
+            bend: draw.maybe(Draw::bend),
             bend: bend(draw, i),
         };
         let pong = OperatorDatagram::Pong {
