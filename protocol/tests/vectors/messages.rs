@@ -3,9 +3,9 @@
 use serde::Serialize;
 use serde_json::json;
 use telemime_protocol::checkpoint::path::{PathGrid, PathKnot, tick_of};
+use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
-use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::v1::*;
 use telemime_protocol::wire::{codec, frame};
@@ -411,6 +411,7 @@ pub(crate) fn messages() -> Vec<Vector> {
             seq: draw.u32(),
             t_us: draw.signed(53),
             lease_ms: draw.u16(),
+            bend: draw.maybe(Draw::bend),
             bend: bend(draw, i),
         };
         let pong = OperatorDatagram::Pong {
