@@ -184,7 +184,8 @@ def example():
         "name": "wave", "duration_s": 2.0, "pace": [0.75, 0.125],
         "motion": [{"weight": 1.0, "mean": [1.0, 0.5, 0.0, 2.0], "covariance": sum(unit, [])}],
         "predictor": {
-            "mean": [0.0] * 15, "scale": [0.5] * 15, "covariance": [2.0] * j, "novelty90": 16.0,
+            "mean": [0.0] * 15, "scale": [0.5] * 15, "bend": [0.125, 0.0], "training": [0.03125, 8.0],
+            "covariance": [2.0] * j, "novelty90": 16.0,
             "errors": [[0.03125, 0.0625, 0.25, 0.5]] * j, "lead": [[0.5 * k, 0.0, 0.125 * k, 0.0] for k in range(1, j + 1)],
             "products": [0.25] * 10, "exponents": e,
             "components": [component(0.75, 0, 0.125, 0.25), component(0.25, 1, -0.0625, 0.5)],

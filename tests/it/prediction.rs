@@ -267,9 +267,8 @@ fn report(set: &str, scores: &Scores) {
     }
 }
 
-/// Ratios to hold at 100, 200 and 300 ms that the mixture alone and the fused experts must reach within 2 %;
-/// returns the latter.
-fn must_reach(set: &str, scores: &Scores, bars: [[f64; 3]; 2]) -> [f64; 3] {
+/// Ratios to hold at 100, 200 and 300 ms that the mixture alone and the fused experts must reach within 2 %.
+fn must_reach(set: &str, scores: &Scores, bars: [[f64; 3]; 2]) {
     report(set, scores);
     for (name, bars) in ["gmr", "fused"].into_iter().zip(bars) {
         for (knot, bar) in [3, 6, 9].into_iter().zip(bars) {
@@ -280,10 +279,33 @@ fn must_reach(set: &str, scores: &Scores, bars: [[f64; 3]; 2]) -> [f64; 3] {
             );
         }
     }
-    [3, 6, 9].map(|knot| scores.ratio("fused", knot))
 }
 
-/// The prototype's mixture gives .403/.373/.351, .393/.331/.285, .332/.318/.299, .423/.393/.372 and .517/.504/.528 here.
+/// Of the mixture alone and of the fused experts. The prototype's mixture gives .403/.373/.351, .393/.331/.285,
+/// .332/.318/.299, .423/.393/.372 (geometric mean .386/.353/.325) and .517/.504/.528.
+const GESTURES: [(&str, [[f64; 3]; 2]); 5] = [
+    (
+        "utd_mhad/a03_wave",
+        [[0.386, 0.358, 0.346], [0.395, 0.385, 0.392]],
+    ),
+    (
+        "utd_mhad/a01_swipe_left",
+        [[0.378, 0.320, 0.281], [0.390, 0.343, 0.318]],
+    ),
+    (
+        "utd_mhad/a09_circle_cw",
+        [[0.319, 0.305, 0.283], [0.321, 0.328, 0.320]],
+    ),
+    (
+        "utd_mhad/a15_tennis_swing",
+        [[0.409, 0.383, 0.365], [0.423, 0.409, 0.388]],
+    ),
+    (
+        "kard/a01_horizontal_arm_wave",
+        [[0.504, 0.481, 0.502], [0.509, 0.504, 0.541]],
+    ),
+];
+
 #[test]
 fn gestures_are_predicted_better_than_by_the_prototype() {
     let mut product = [1.0_f64; 3];
@@ -292,25 +314,19 @@ fn gestures_are_predicted_better_than_by_the_prototype() {
             return;
         };
         let scores = evaluate(&by_person(&folder), 3, false);
-        let fused = must_reach(set, &scores, bars);
+        must_reach(set, &scores, bars);
         if set.starts_with("utd_mhad") {
-            product.iter_mut().zip(fused).for_each(|(p, r)| *p *= r);
+            for (p, knot) in product.iter_mut().zip([3, 6, 9]) {
+                *p *= scores.ratio("gmr", knot);
+            }
         }
     }
     let mean = product.map(|p| p.powf(0.25));
-    println!("utd_mhad, geometric mean: {mean:.3?}");
-    for (ratio, bar) in mean.into_iter().zip([0.38, 0.34, 0.32]) {
-        assert!(true || ratio <= 1.01 * bar, "{mean:.3?}");
+    println!("utd_mhad, geometric mean of the mixture: {mean:.3?}");
+    for (ratio, aim) in mean.into_iter().zip([0.38, 0.34, 0.32]) {
+        assert!(ratio <= aim, "{mean:.3?}");
     }
 }
-
-const GESTURES: [(&str, [[f64; 3]; 2]); 5] = [
-    ("utd_mhad/a03_wave", [[0.388, 0.360, 0.348], [9.0; 3]]),
-    ("utd_mhad/a01_swipe_left", [[0.380, 0.322, 0.284], [9.0; 3]]),
-    ("utd_mhad/a09_circle_cw", [[0.322, 0.307, 0.288], [9.0; 3]]),
-    ("utd_mhad/a15_tennis_swing", [[0.415, 0.388, 0.370], [9.0; 3]]),
-    ("kard/a01_horizontal_arm_wave", [[0.508, 0.485, 0.507], [9.0; 3]]),
-];
 
 /// What other people's demonstrations are worth where there are two own ones.
 #[test]

@@ -62,11 +62,21 @@ class Model:
                 "gain": [gain[3 * a : 3 * a + 3] for a in range(15)], "residual": residual,
             })  # fmt: skip
 
+    def bent(self, features):
+        """15 numbers, the differences to the two quickest memories on a logarithmic scale."""
+        f = list(features)
+        for i, b in enumerate(self.p["bend"]):
+            at = slice(3 * (i + 1), 3 * (i + 2))
+            length = math.sqrt(norm2(f[at]))
+            if b > 0 and length > 0:
+                f[at] = [u * (b * math.log(1 + length / b) / length) for u in f[at]]
+        return f
+
     def respond(self, features):
         """(weights, standardised differences, novelty): `features` holds 15 numbers, or 15 for each component."""
         apart, novelty, logs = [], math.inf, []
         for k, c in enumerate(self.components):
-            f = features[k] if self.charts else features
+            f = self.bent(features[k] if self.charts else features)
             e = [(a - m) / s - mu for a, m, s, mu in zip(f, self.p["mean"], self.p["scale"], c["mean"])]
             z = []
             for row, value in zip(c["low"], e):
