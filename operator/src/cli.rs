@@ -1,6 +1,7 @@
 //! The operator daemon's command line: flags over a TOML file over defaults.
 
 mod infer;
+mod pair;
 mod played;
 mod report;
 mod skills;
@@ -14,39 +15,50 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 use serde::Deserialize;
+use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
-use telemime_endpoint::{Fingerprint, HostClock, Identity, Meter, Mono, quic};
+use telemime_endpoint::peers::{Peers, PeersError, Role, Source, Whom};
+use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Mono, Trust, quic};
 use tokio::sync::mpsc;
 
 use crate::daemon::{Daemon, Learning};
-use crate::placed::Placed;
-use crate::session::{FutureBound, SessionConfig};
+use crate::demonstration::{Demonstration, Sample};
+use crate::placed::{Motion, Placed};
+use crate::session::{FutureBound, Leeway, SessionConfig};
 use crate::task::{Outcome, Recording, Task};
 pub use infer::{Bounds, infer};
+pub use pair::{PairArgs, pair};
 use played::Played;
 pub use report::{Event, PlayReport, Scores, TurnScores};
 pub use skills::Skills;
 
 /// Teach, drive and play a robot.
 ///
-/// Replays a recording as if the hand were there (--replay), or plays a learned skill (--play). The operator
-/// makes its key at the first start and prints its fingerprint; give that to the robot with --peer, and the
-/// robot's to the operator. On the terminal, type stop (emergency stop), reset, or quit; keep takes the performance
-/// driven last as a demonstration, refine learns from those kept, and save FILE writes the skill as it is now.
+/// Replays a recording as if the hand were there (--replay), or plays a learned skill (--play). The robot must be
+/// known: pair with it once (`telemime pair HOST:PORT`), or give the fingerprint it prints with --peer. On the
+/// terminal, type stop (emergency stop), reset, or quit; keep takes the performance driven last as a demonstration,
+/// refine learns from those kept, and save FILE writes the skill as it is now.
 #[derive(clap::Args, Debug, Clone, Default)]
 pub struct Args {
     /// Read settings from this TOML file; flags override it.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// The robot.
-    #[arg(long, value_name = "HOST:PORT")]
+    /// The robot: where it is, or the name it was paired by.
+    #[arg(long, value_name = "HOST:PORT|NAME")]
     pub connect: Option<String>,
     /// This operator's private key, made if missing [default: ~/.config/telemime/operator.key].
     #[arg(long, value_name = "FILE")]
     pub identity: Option<PathBuf>,
-    /// The robot's fingerprint.
+    /// The robot's fingerprint, if it was not paired.
     #[arg(long, value_name = "FINGERPRINT")]
     pub peer: Option<String>,
+    /// The robots that were paired [default: ~/.config/telemime/peers].
+    #[arg(long, value_name = "FILE")]
+    pub peer_file: Option<PathBuf>,
+    /// The system clock is kept right (by PTP, chrony or the like) to within this, 50us for example; if the robot's is
+    /// too, a path slower one way than the other is seen [default: round trips alone].
+    #[arg(long, value_name = "TIME", value_parser = cli::dispersion)]
+    pub clock_dispersion: Option<Duration>,
     /// Learn a skill from this folder of demonstrations (CSV: t,x,y,z) at the start; may be repeated.
     #[arg(long, value_name = "DIR")]
     pub learn: Vec<PathBuf>,
@@ -76,6 +88,15 @@ pub struct Args {
         conflicts_with = "replay"
     )]
     pub frame: Vec<Placed>,
+    /// Play: a hand corrects the motion; a recording (CSV: t,x,y,z) whose times count from when the robot begins. Where
+    /// it has samples the hand holds on, and moving it bends the motion; where it has none for more than 0.25 s the hand
+    /// has let go, and the skill goes on.
+    #[arg(long, value_name = "FILE", conflicts_with = "replay")]
+    pub correct: Option<PathBuf>,
+    /// How exactly the hand means its corrections, m: against the skill's own deviation this decides how much they
+    /// bend it [default: 0.02].
+    #[arg(long, value_name = "M")]
+    pub hand_sigma: Option<f64>,
     /// Play: largest error of the rebuilt motion, m [default: 1 % of the skill's reach].
     #[arg(long, value_name = "M")]
     pub bound: Option<f64>,
@@ -91,9 +112,10 @@ pub struct Args {
     /// How old a sample is when the input hands it over, 0 to 300ms: `telemime tap` measures it [default: 0ms].
     #[arg(long, value_name = "TIME", value_parser = parse_latency)]
     pub input_latency: Option<f64>,
-    /// Take every sample as it comes: no sample is replaced that a tracker got wrong for a frame or two.
+    /// For a tracker that takes something else for the hand now and then: replace one or two samples running that the
+    /// predictor all but rules out. A hand that jumps farther than it ever did is believed two samples later.
     #[arg(long)]
-    pub no_glitch_gate: bool,
+    pub glitch_gate: bool,
     /// Prediction gain, 0 (none) to 1.
     #[arg(long)]
     pub gain: Option<f64>,
@@ -234,6 +256,8 @@ struct File {
     connect: Option<String>,
     identity: Option<PathBuf>,
     peer: Option<String>,
+    peer_file: Option<PathBuf>,
+    clock_dispersion: Option<String>,
     #[serde(default)]
     learn: Vec<PathBuf>,
     #[serde(rename = "match")]
@@ -245,6 +269,8 @@ struct File {
     play: Option<String>,
     #[serde(default)]
     frames: BTreeMap<String, Vec<f64>>,
+    correct: Option<PathBuf>,
+    hand_sigma_m: Option<f64>,
     bound_m: Option<f64>,
     turn_bound_rad: Option<f64>,
     scale: Option<f64>,
@@ -285,6 +311,10 @@ impl Args {
         self.connect = self.connect.or(file.connect);
         self.identity = self.identity.or(file.identity);
         self.peer = self.peer.or(file.peer);
+        self.peer_file = self.peer_file.or(file.peer_file);
+        let dispersion = file.clock_dispersion.as_deref().map(cli::dispersion);
+        let dispersion = dispersion.transpose().map_err(anyhow::Error::msg)?;
+        self.clock_dispersion = self.clock_dispersion.or(dispersion);
         if self.learn.is_empty() && self.skill.is_empty() {
             (self.learn, self.skill) = (file.learn, file.skills);
         }
@@ -305,7 +335,7 @@ impl Args {
                 .map_err(|e| anyhow::anyhow!("{}: [input] latency_ms = {e}", path.display()))?;
             self.input_latency = Some(latency);
         }
-        self.no_glitch_gate |= file.input.glitch_gate == Some(false);
+        self.glitch_gate |= file.input.glitch_gate.unwrap_or(false);
         if self.frame.is_empty() && self.play.is_some() {
             self.frame = file
                 .frames
@@ -314,6 +344,10 @@ impl Args {
                 .collect::<Result<_, _>>()
                 .with_context(|| format!("{}: [frames]", path.display()))?;
         }
+        if self.play.is_some() {
+            self.correct = self.correct.or(file.correct);
+        }
+        self.hand_sigma = self.hand_sigma.or(file.hand_sigma_m);
         self.bound = self.bound.or(file.bound_m);
         self.turn_bound = self.turn_bound.or(file.turn_bound_rad);
         self.scale = self.scale.or(file.scale);
@@ -340,8 +374,9 @@ impl Args {
             future_bound: self.future_bound.unwrap_or(defaults.future_bound),
             path_bound_m: self.path_bound,
             input_latency_s: self.input_latency.unwrap_or(0.0),
-            glitch_gate: !self.no_glitch_gate,
+            glitch_gate: self.glitch_gate,
             gain: self.gain.unwrap_or(defaults.gain),
+            hand_sigma_m: self.hand_sigma.unwrap_or(defaults.hand_sigma_m),
             scale: self.scale,
             rotation: self.axes.unwrap_or_default().rotation(),
             versions: telemime_endpoint::cli::versions(self.protocol_max)?,
@@ -362,6 +397,7 @@ impl Args {
             -f64::EPSILON,
             config.max_silence_s,
         )?;
+        within("--hand-sigma", config.hand_sigma_m, 0.0, 1.0)?;
         within("--gain", config.gain, -f64::EPSILON, 1.0)?;
         if let Some(scale) = config.scale {
             within("--scale", scale, 0.0, 10.0)?;
@@ -390,11 +426,13 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     let Some(connect) = &args.connect else {
         bail!("which robot? Give --connect HOST:PORT (or connect = \"…\" in the configuration)");
     };
-    let robot: SocketAddr = cli::resolve(connect).map_err(anyhow::Error::msg)?;
+    let peer_file = args.peer_file.clone().unwrap_or_else(admin::peer_file);
+    let known = Known::find(&Peers::load(&peer_file)?, connect, args.peer.as_deref())?;
+    let robot: SocketAddr = cli::resolve(&known.address).map_err(anyhow::Error::msg)?;
     let key = args
         .identity
         .clone()
-        .unwrap_or_else(|| cli::config_dir().join("operator.key"));
+        .unwrap_or_else(|| admin::key_file(Role::Operator));
     let identity = Identity::load_or_create(&key)?;
     let (out, printing) = Printer::start().context("no thread to print from")?;
     let log = report::Log {
@@ -404,32 +442,39 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     log.say(&Event::Fingerprint {
         fingerprint: identity.fingerprint().to_string(),
     });
-    let Some(peer) = &args.peer else {
+    let Some(key) = known.key else {
         bail!(
-            "whose robot? Give its fingerprint with --peer; ours is {} (for the robot's --peer)",
+            "whose robot? It is not known yet: run `telemime pair {connect}` while it has a pairing window open, or give its \
+             fingerprint with --peer; ours is {} (for the robot's --peer)",
             identity.fingerprint()
         );
     };
-    let peer: Fingerprint = peer.parse()?;
+    let source = Source {
+        path: peer_file,
+        whom: Whom::Robot {
+            key,
+            given: args.peer.is_some(),
+        },
+    };
+    let trust = Trust::new([]);
+    source.read(&trust)?;
     let skills = Skills::gather(&args, &log)?;
     let (mut task, played) = make_task(&args, &skills, config.rotation, &log)?;
 
     let (quit, words) = cli::listen(args.follow_stdin, cli::OPERATOR_WORDS, || {})?;
     let meter = Meter::default();
-    let local = SocketAddr::from(if robot.is_ipv4() {
-        (std::net::IpAddr::from([0; 4]), 0)
-    } else {
-        (std::net::IpAddr::from([0; 16]), 0)
-    });
-    let endpoint = quic::client(&identity, peer, quic::Socket::bind(local)?, &meter)?;
+    let socket = quic::Socket::bind(any_port(robot))?;
+    let endpoint = quic::client(&identity, &trust, socket, &meter)?;
     let clock = HostClock::new();
     let daemon = Daemon {
         endpoint,
+        trust: trust.clone(),
         meter,
         robot,
         clock,
         // A second before now, so that a sensor's latency may be subtracted from the first sample.
         epoch: Mono(clock.now().0 - 1_000_000_000),
+        external: args.clock_dispersion.map(External::host),
         skill: skills.mirror(),
         recogniser: skills.recogniser(&log),
         config,
@@ -449,10 +494,14 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         progress,
         played,
     ));
-    let done = daemon.run(&mut task, quit, words, &notices).await;
+    let complain = |e| log.note(&format!("{e}; the robot is trusted as before"));
+    let done = tokio::select! {
+        done = daemon.run(&mut task, quit, words, &notices) => Some(done),
+        () = source.follow(&trust, complain) => None,
+    };
     drop(notices);
     let played = listener.await.context("the log ended early")?;
-    let summary = done?;
+    let summary = done.context("the peer file is not followed any more")??;
     if let Some(scores) = played.and_then(|played| played.scores()) {
         log.say(&scores);
     }
@@ -462,6 +511,58 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     match summary.outcome {
         Outcome::Completed => Ok(()),
         Outcome::Interrupted(why) => bail!("{why}"),
+    }
+}
+
+/// An address of ours from which `to` can be reached.
+fn any_port(to: SocketAddr) -> SocketAddr {
+    SocketAddr::from(if to.is_ipv4() {
+        (std::net::IpAddr::from([0; 4]), 0)
+    } else {
+        (std::net::IpAddr::from([0; 16]), 0)
+    })
+}
+
+/// Where a robot is, and its key if we know it.
+#[derive(Debug)]
+struct Known {
+    address: String,
+    key: Option<Fingerprint>,
+}
+
+impl Known {
+    /// What `connect` means, and `peer`, a fingerprint given besides. A robot that is known by another key, or whose
+    /// key was revoked, is refused before anything is sent to it.
+    fn find(peers: &Peers, connect: &str, peer: Option<&str>) -> anyhow::Result<Self> {
+        let given: Option<Fingerprint> = peer.map(str::parse).transpose()?;
+        let known = peers.robot(connect);
+        let key = given.or(known.map(|known| known.key));
+        let held = peers
+            .iter()
+            .find(|p| p.role == Role::Robot && Some(p.key) == key);
+        if let Some(revoked) = held.filter(|held| held.revoked) {
+            return Err(PeersError::Revoked {
+                name: revoked.name.clone(),
+                key: revoked.key,
+            }
+            .into());
+        }
+        if let (Some(known), Some(new)) = (known, given)
+            && known.key != new
+        {
+            return Err(PeersError::AddressTaken {
+                address: connect.to_owned(),
+                name: known.name.clone(),
+                known: known.key,
+                new,
+            }
+            .into());
+        }
+        let address = known.and_then(|known| known.address.clone());
+        Ok(Self {
+            address: address.unwrap_or_else(|| connect.to_owned()),
+            key,
+        })
     }
 }
 
@@ -495,11 +596,36 @@ fn make_task(
             log.say(&Event::Plan(report));
             // Demonstrations that went elsewhere are no measure of a motion with its frames moved.
             let shown = skills.aligned(name).filter(|_| args.frame.is_empty());
-            let played = Played::new(plan.curve()?, shown, rotation);
-            Ok((Task::play(plan), Some(played)))
+            let curve = plan.curve()?;
+            let task = match &args.correct {
+                Some(path) => {
+                    let samples = correction(path, curve.end_s())?;
+                    let motion = Motion::new(&skill, &args.frame)?;
+                    let leeway = Leeway::of(&motion, skill.duration_s());
+                    Task::play_corrected(plan, leeway, samples)
+                }
+                None => Task::play(plan),
+            };
+            Ok((task, Some(Played::new(curve, shown, rotation))))
+        }
+        ([_, ..], _) if args.correct.is_some() => {
+            bail!("--correct bends a skill that is played; a replay is the hand itself")
         }
         _ => bail!("what to do? Give --replay FILE or --play SKILL"),
     }
+}
+
+/// The hand that corrects a play of `end_s`.
+fn correction(path: &Path, end_s: f64) -> anyhow::Result<Vec<Sample>> {
+    let recording = Demonstration::read_beside(path)?;
+    let first_s = recording.samples()[0].t_s;
+    if !(0.0..end_s).contains(&first_s) {
+        bail!(
+            "{}: the first sample is at {first_s:.2} s, but its times count from when the robot begins a motion of {end_s:.2} s",
+            path.display()
+        );
+    }
+    Ok(recording.samples().to_vec())
 }
 
 #[cfg(test)]
@@ -514,6 +640,40 @@ mod tests {
         assert!((to(0.0, 0.0, -1.0) - Vector3::x()).norm() < 1e-12);
         assert!((to(-1.0, 0.0, 0.0) - Vector3::y()).norm() < 1e-12);
         assert!((to(0.0, 1.0, 0.0) - Vector3::z()).norm() < 1e-12);
+    }
+
+    #[test]
+    fn a_robot_is_known_by_name_and_address_and_another_key_is_refused() {
+        let key = |n: u8| Fingerprint::of_spki(&[n]);
+        let mut peers = Peers::default();
+        let name = telemime_endpoint::peers::Name::new("arm").unwrap();
+        let address = Some("lab:4433".to_owned());
+        let arm = telemime_endpoint::peers::Peer::new(name, Role::Robot, key(1), address);
+        peers.pin(arm).unwrap();
+        for connect in ["arm", "lab:4433"] {
+            let known = Known::find(&peers, connect, None).unwrap();
+            assert_eq!(
+                (known.address.as_str(), known.key),
+                ("lab:4433", Some(key(1)))
+            );
+            let same = Known::find(&peers, connect, Some(&key(1).to_string())).unwrap();
+            assert_eq!(same.key, Some(key(1)));
+            let error = Known::find(&peers, connect, Some(&key(2).to_string())).unwrap_err();
+            assert!(
+                error.to_string().contains("telemime peers remove arm"),
+                "{error}"
+            );
+        }
+        let unknown = Known::find(&peers, "other:4433", None).unwrap();
+        assert_eq!(
+            (unknown.address.as_str(), unknown.key),
+            ("other:4433", None)
+        );
+        peers.revoke("arm").unwrap();
+        for (connect, peer) in [("arm", None), ("other:4433", Some(key(1).to_string()))] {
+            let error = Known::find(&peers, connect, peer.as_deref()).unwrap_err();
+            assert!(error.to_string().contains("revoked"), "{error}");
+        }
     }
 
     #[test]

@@ -1,29 +1,37 @@
 //! The robot daemon's command line: flags over a TOML file over defaults.
 
+use std::io::IsTerminal;
 use std::io::Write as _;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use serde::{Deserialize, Serialize};
+use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
-use telemime_endpoint::{Fingerprint, HostClock, Identity, Meter, quic};
+use telemime_endpoint::pairing::{Candidate, Own};
+use telemime_endpoint::peers::{Role, Source, Whom};
+use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Trust, quic};
 use telemime_sim::arm::LoadOptions;
 use telemime_sim::link::parse_duration_s;
 use tokio::sync::mpsc;
 
+use crate::clock::Origin;
 use crate::control::ControlConfig;
 use crate::daemon::{Daemon, Notice};
+use crate::desk::{Desk, Progress};
+use crate::refused::Refused;
 use crate::rig::{Rig, RigOptions};
 use crate::servo::{self, Report, Ticket};
 use crate::session::SessionConfig;
 
 /// Drive an arm for an operator.
 ///
-/// The robot makes its key at the first start and prints its fingerprint; give that to the operator with
-/// --peer, and the operator's to the robot. Without a peer nobody is let in. On the terminal, type stop
-/// (emergency stop, latched), reset or quit.
+/// Nobody is let in whose key is not known: pair an operator (--pair, or pair on the terminal, and `telemime pair`
+/// at the operator), or give the fingerprint it prints with --peer. On the terminal, type stop (emergency stop,
+/// latched), reset, pair, yes, no or quit.
 #[derive(clap::Args, Debug, Clone, Default)]
 pub struct Args {
     /// Read settings from this TOML file; flags override it.
@@ -35,9 +43,25 @@ pub struct Args {
     /// This robot's private key, made if missing [default: ~/.config/telemime/robot.key].
     #[arg(long, value_name = "FILE")]
     pub identity: Option<PathBuf>,
-    /// Fingerprint of an operator to let in; may be repeated.
+    /// Fingerprint of an operator to let in, besides those in the peer file; may be repeated.
     #[arg(long, value_name = "FINGERPRINT")]
     pub peer: Vec<String>,
+    /// The operators that were paired; changes are noticed [default: ~/.config/telemime/peers].
+    #[arg(long, value_name = "FILE")]
+    pub peer_file: Option<PathBuf>,
+    /// Open a pairing window at the start, for this long [60s if nothing is said].
+    #[arg(long, value_name = "TIME", num_args = 0..=1, default_missing_value = "60s", value_parser = cli::seconds)]
+    pub pair: Option<Duration>,
+    /// Pair only with the key of this fingerprint, and without asking.
+    #[arg(long, value_name = "FINGERPRINT")]
+    pub pair_expect: Option<String>,
+    /// The system clock is kept right (by PTP, chrony or the like) to within this, 50us for example; if the operator's
+    /// is too, a path slower one way than the other is seen [default: round trips alone].
+    #[arg(long, value_name = "TIME", value_parser = cli::dispersion)]
+    pub clock_dispersion: Option<Duration>,
+    /// What this robot calls itself to operators that pair [default: the host's name].
+    #[arg(long, value_name = "NAME")]
+    pub name: Option<String>,
     /// The arm [default: a 7-axis arm of our own].
     #[arg(long, value_name = "FILE")]
     pub urdf: Option<PathBuf>,
@@ -83,6 +107,9 @@ struct File {
     identity: Option<PathBuf>,
     #[serde(default)]
     peers: Vec<String>,
+    peer_file: Option<PathBuf>,
+    name: Option<String>,
+    clock_dispersion: Option<String>,
     urdf: Option<PathBuf>,
     tip: Option<String>,
     #[serde(default)]
@@ -129,9 +156,21 @@ pub enum Event {
         dropped: u32,
         clock_offset_s: Option<f64>,
         clock_bound_s: Option<f64>,
+        clock_origin: String,
     },
     Refused {
+        reason: String,
+        peer: SocketAddr,
         why: String,
+        times: u32,
+    },
+    Pairing {
+        stage: String,
+        seconds: Option<f64>,
+        name: Option<String>,
+        fingerprint: Option<String>,
+        code: Option<String>,
+        why: Option<String>,
     },
     State {
         state: String,
@@ -177,17 +216,34 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         None => File::default(),
     };
     let identity = args.identity.clone().or(file.identity);
-    let identity =
-        Identity::load_or_create(&identity.unwrap_or_else(|| cli::config_dir().join("robot.key")))?;
-    let peers = if args.peer.is_empty() {
+    let key_file = identity.unwrap_or_else(|| admin::key_file(Role::Robot));
+    let identity = Identity::load_or_create(&key_file)?;
+    let given = if args.peer.is_empty() {
         file.peers
     } else {
         args.peer.clone()
     };
-    let peers = peers
+    let given = given
         .iter()
         .map(|p| p.parse())
         .collect::<Result<Vec<Fingerprint>, _>>()?;
+    let expected = args.pair_expect.as_ref().map(|text| text.parse());
+    let expected: Option<Fingerprint> = expected.transpose()?;
+    let dispersion = file.clock_dispersion.as_deref().map(cli::dispersion);
+    let dispersion = dispersion.transpose().map_err(anyhow::Error::msg)?;
+    let dispersion = args.clock_dispersion.or(dispersion);
+    let peer_file = args.peer_file.clone().or(file.peer_file);
+    let source = Source {
+        path: peer_file.unwrap_or_else(admin::peer_file),
+        whom: Whom::Operators(given),
+    };
+    let trust = Trust::new([]);
+    source.read(&trust)?;
+    let own = Own {
+        name: admin::own_name(args.name.as_deref().or(file.name.as_deref()))?,
+        key: identity.fingerprint(),
+    };
+    let mut desk = Desk::new(own, trust.clone(), Some(source.path.clone())).expecting(expected);
     let mut fixed = file.fixed;
     fixed.extend(args.fixed.iter().cloned());
     let options = RigOptions {
@@ -227,10 +283,18 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let socket = quic::Socket::bind(listen).with_context(|| {
         format!("cannot listen on {listen}: choose another --listen, or stop what uses it")
     })?;
-    if peers.is_empty() && !args.json {
-        eprintln!("note: no --peer given: nobody will be let in");
+    let deaf = !args.follow_stdin && !std::io::stdin().is_terminal();
+    if trust.is_empty() && args.pair.is_none() && !args.json {
+        eprintln!(
+            "note: no operator is known, so nobody will be let in: pair one (pair, or --pair), or give --peer"
+        );
     }
-    let endpoint = quic::server(&identity, peers, socket, &Meter::default())?;
+    if args.pair.is_some() && expected.is_none() && deaf {
+        eprintln!(
+            "note: stdin is no terminal, so nobody can say yes to a code: give --pair-expect FINGERPRINT"
+        );
+    }
+    let endpoint = quic::server(&identity, &trust, socket, &Meter::default())?;
     let addr = endpoint.local_addr()?;
     let (rings, handle) = servo::rings();
     let running = servo::thread::Servo::start(rig.servo(rings)).context("no servo thread")?;
@@ -254,13 +318,17 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         },
         || {
             format!(
-                "{} ({} joints) listens on {addr}\nfingerprint {}",
+                "{} ({} joints) listens on {addr}\nfingerprint {}\nin short    {}",
                 rig.arm.name(),
                 rig.arm.dof(),
-                identity.fingerprint()
+                identity.fingerprint(),
+                identity.fingerprint().short()
             )
         },
     );
+    if let Some(span) = args.pair {
+        log.pairing(&desk.open(span));
+    }
     let daemon = Daemon::new(
         endpoint,
         HostClock::new(),
@@ -271,10 +339,15 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         },
         handle,
         Some(running.timing.clone()),
+        desk,
     );
+    let daemon = daemon.with_external(dispersion.map(External::host));
     let (notices, heard) = mpsc::unbounded_channel();
     let listener = tokio::spawn(listen_to(heard, log.clone(), recorder));
-    let served = daemon.run(quit, words, notices).await;
+    let served = tokio::select! {
+        served = daemon.run(quit, words, notices) => served,
+        () = source.follow(&trust, |e| eprintln!("note: {e}; whoever was trusted still is")) => Ok(()),
+    };
     let recorder = listener.await.context("the log ended early")?;
     let (ticks, mean_ns, p99_ns, overruns) = running.timing.read();
     // The servo outlives everything that could still ask for motion; it ends at rest.
@@ -321,6 +394,52 @@ impl Log {
         } else {
             self.out.say(text());
         }
+    }
+
+    fn pairing(&self, progress: &Progress) {
+        let (stage, candidate) = match progress {
+            Progress::Open(_) => ("open", None),
+            Progress::TooSoon(_) => ("too_soon", None),
+            Progress::Code(candidate) => ("code", Some(candidate)),
+            Progress::Paired(candidate) => ("paired", Some(candidate)),
+            Progress::Ended(_) => ("ended", None),
+            Progress::Nothing => ("nothing", None),
+        };
+        let (seconds, why) = match progress {
+            Progress::Open(span) | Progress::TooSoon(span) => (Some(span.as_secs_f64()), None),
+            Progress::Ended(why) => (None, Some(why.to_string())),
+            _ => (None, None),
+        };
+        let text = || match progress {
+            Progress::Open(span) => format!(
+                "pairing: the window is open for {:.0} s and one attempt; at the operator, run telemime pair HOST:PORT",
+                span.as_secs_f64()
+            ),
+            Progress::TooSoon(span) => {
+                format!(
+                    "pairing: too soon after the last window; wait {:.0} s",
+                    span.as_secs_f64().ceil()
+                )
+            }
+            Progress::Code(Candidate { name, key, code }) => format!(
+                "pairing: operator {name}, key {}\n\n    {code}\n\nDoes the operator show the same? Type yes or no.",
+                key.short()
+            ),
+            Progress::Paired(Candidate { name, key, .. }) => {
+                format!("pairing: operator {name} is trusted from now on\nfingerprint {key}")
+            }
+            Progress::Ended(why) => format!("pairing: ended without one: {why}"),
+            Progress::Nothing => "pairing: there is nothing to say yes or no to".to_owned(),
+        };
+        let event = Event::Pairing {
+            stage: stage.to_owned(),
+            seconds,
+            name: candidate.map(|c| c.name.to_string()),
+            fingerprint: candidate.map(|c| c.key.to_string()),
+            code: candidate.map(|c| c.code.to_string()),
+            why,
+        };
+        self.say(&event, text);
     }
 }
 
@@ -375,6 +494,7 @@ async fn listen_to(
             Notice::Disconnected {
                 why,
                 clock,
+                origin,
                 counters,
             } => {
                 let event = Event::Disconnected {
@@ -383,10 +503,18 @@ async fn listen_to(
                     dropped: counters.dropped,
                     clock_offset_s: clock.map(|c| c.0),
                     clock_bound_s: clock.map(|c| c.1),
+                    clock_origin: origin.word().to_owned(),
                 };
                 log.say(&event, || {
                     let clock = clock.map_or_else(String::new, |(_, bound_s)| {
-                        format!("; session clock known to ±{:.1} ms", bound_s * 1e3)
+                        let how = match origin {
+                            Origin::RoundTrips => "",
+                            Origin::Disciplined => " by the disciplined clocks",
+                            Origin::Contradicted => {
+                                " (the disciplined clocks are wrong by more than --clock-dispersion says: no round trip explains them)"
+                            }
+                        };
+                        format!("; session clock known to ±{:.2} ms{how}", bound_s * 1e3)
                     });
                     format!(
                         "session ended: {why}; {} motions, {} dropped{clock}",
@@ -394,14 +522,37 @@ async fn listen_to(
                     )
                 });
             }
-            Notice::Refused { why } => log.say(&Event::Refused { why: why.clone() }, || {
-                format!("refused {why}")
-            }),
+            Notice::Refused(refused) => {
+                let Refused {
+                    peer,
+                    reason,
+                    why,
+                    times,
+                } = refused;
+                let text = format!("refused {peer}: {why}{}", nth(times));
+                let event = Event::Refused {
+                    reason: reason.word().to_owned(),
+                    peer,
+                    why,
+                    times,
+                };
+                log.say(&event, || text);
+            }
+            Notice::Pairing(progress) => log.pairing(&progress),
             Notice::Path(knots) if log.json => log.say(&Event::Path { knots }, String::new),
             Notice::Path(_) => {}
         }
     }
     recorder
+}
+
+/// How often somebody was turned away, if not for the first time.
+fn nth(times: u32) -> String {
+    if times > 1 {
+        format!(" (for the {times}th time)")
+    } else {
+        String::new()
+    }
 }
 
 fn engaged(report: &Report) -> Event {

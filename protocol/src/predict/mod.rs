@@ -2,9 +2,10 @@
 //!
 //! [`HandState`] is all that is known of the hand, [`Model`] what was learned, [`Params`] what the
 //! operator adapts; [`Model::forecast`] is a pure function of the three, and keeps nothing.
-//! [`TurnState`], [`TurnModel`] and [`TurnForecast`] are the same for its orientation.
+//! [`Bend`] is what a hand makes of a plan that is played. [`TurnState`], [`TurnModel`] and [`TurnForecast`] are the same for its orientation.
 
 mod ahead;
+mod bend;
 mod experts;
 mod forecast;
 mod model;
@@ -14,6 +15,7 @@ mod state;
 mod turn;
 
 pub use ahead::{Ahead, Knot, Way};
+pub use bend::{Bend, Held, LET_GO_TAU_S, MAX_RATE, PUSH_REACH_S};
 pub use experts::{Experts, Generic};
 pub use forecast::{Forecast, Prediction};
 pub use model::{BLOCK, Calibration, Model, ModelError, Posterior, Regression, TARGETS, TEMPER};

@@ -3,6 +3,7 @@
 use serde::Serialize;
 use serde_json::json;
 use telemime_protocol::checkpoint::path::{PathGrid, PathKnot, tick_of};
+use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
@@ -226,6 +227,21 @@ fn motion(draw: &mut Draw, knot_count: usize) -> Motion {
     }
 }
 
+fn bend(draw: &mut Draw, i: usize) -> Option<WireBend> {
+    let held = WireHeld {
+        state: draw.state(),
+        gain: draw.u8(),
+        straight: draw.u8(),
+        weight: [127, -63, 0, 63, 1, 64],
+    };
+    (i > 0).then(|| WireBend {
+        plan_us: draw.signed(40),
+        rate: [0, 128, 192][i % 3],
+        left: [draw.signed(18) as i32, 0, -1_000_000],
+        held: (i > 1).then_some(held),
+    })
+}
+
 fn telemetry(draw: &mut Draw) -> Telemetry {
     Telemetry {
         epoch: draw.u32(),
@@ -301,6 +317,17 @@ pub(crate) fn messages() -> Vec<Vector> {
             OPERATOR_DATAGRAM,
             "stop",
             &OperatorDatagram::Stop { epoch: 7 },
+        ),
+        message(
+            OPERATOR_DATAGRAM,
+            "clock",
+            &OperatorDatagram::Clock {
+                epoch: 7,
+                clock: ExternalClock {
+                    ahead_us: 1_792_000_000_000_000,
+                    dispersion_us: 50,
+                },
+            },
         ),
     ];
     for i in 0..8 {
@@ -384,6 +411,8 @@ pub(crate) fn messages() -> Vec<Vector> {
             seq: draw.u32(),
             t_us: draw.signed(53),
             lease_ms: draw.u16(),
+            bend: draw.maybe(Draw::bend),
+            bend: bend(draw, i),
         };
         let pong = OperatorDatagram::Pong {
             epoch: draw.u32(),
