@@ -143,7 +143,7 @@ pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Res
         let (first, last) = (&hold[0], &hold[hold.len() - 1]);
         let within = |t_s: f64| (first.t_s..=last.t_s + 0.1).contains(&t_s);
         let meanwhile = || told.iter().filter(|told| within(told.at.as_secs_f64()));
-        let Some(newest) = meanwhile().last() else {
+        let Some(newest) = meanwhile().next_back() else {
             continue;
         };
         let taken = marks

@@ -126,7 +126,7 @@ pub(super) fn drive(
     let counters = summary.counters;
     let mut driven = judge(&truth, &tip, from_s, &mapping, drive, seed);
     let judged = |r: &&&Report| (from_s..=d.duration_s()).contains(&time_s(r));
-    driven.clamps = engaged.iter().filter(judged).last().map_or(0, |r| r.clamps);
+    driven.clamps = engaged.iter().rfind(judged).map_or(0, |r| r.clamps);
     let jerks = engaged.iter().filter(judged).map(|r| r.jerk_m_s3);
     let hand_jerk = mapping.scale * smooth_jerk_m_s3(&truth, from_s, d.duration_s());
     let ticks = driven.moments as f64;

@@ -108,8 +108,14 @@ pub(super) const TURN_NAMES: [&str; 8] = [
 /// What a session sends: the predictor as it is used.
 pub(super) const GUARDED: &str = "guarded";
 
-/// All of them, for one performance. `kalman` was tuned on what `skill` was learned from.
-pub(super) fn experts(side: Side, skill: &Arc<Skill>, kalman: &Kalman) -> Vec<Box<dyn Expert>> {
+/// All of them, for one performance. `kalman` was tuned on what `skill` was learned from; what a session sends is set
+/// to `session`.
+pub(super) fn experts(
+    side: Side,
+    skill: &Arc<Skill>,
+    kalman: &Kalman,
+    session: &SessionConfig,
+) -> Vec<Box<dyn Expert>> {
     let damped = |factor: f64| -> Box<dyn Expert> { Box::new(Straight::new(side, factor)) };
     let mut all = vec![damped(0.0), damped(1.0), damped(0.5)];
     all.push(Box::new(Generic {
@@ -128,7 +134,7 @@ pub(super) fn experts(side: Side, skill: &Arc<Skill>, kalman: &Kalman) -> Vec<Bo
         posterior: None,
     }));
     all.push(Box::new(Unrested::new(side, skill)));
-    all.push(Box::new(Guarded::new(side, skill)));
+    all.push(Box::new(Guarded::new(side, skill, session)));
     all
 }
 
@@ -402,11 +408,11 @@ struct Guarded {
 const DELAY_S: f64 = 0.1;
 
 impl Guarded {
-    fn new(side: Side, skill: &Arc<Skill>) -> Self {
+    fn new(side: Side, skill: &Arc<Skill>, session: &SessionConfig) -> Self {
         let config = SessionConfig {
             max_silence_s: 0.0,
             min_interval_s: 0.0,
-            ..SessionConfig::default()
+            ..*session
         };
         Self {
             side,

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use crate::data::{data, needs};
-use nalgebra::{SMatrix, Vector3};
+use nalgebra::{Matrix3, SMatrix, Vector3};
 use telemime_operator::demonstration::Demonstration;
 use telemime_operator::learn::predictor::{
     Character, PredictorOptions, states, train, train_from_labels,
@@ -166,12 +166,26 @@ fn rounded(model: &Model) -> Model {
 #[derive(Default)]
 struct Scores {
     squared: BTreeMap<&'static str, Vec<f64>>,
+    /// At every knot the predictions judged, and those whose truth was within the region of 90 %.
+    judged: [[u32; 2]; 24],
 }
 
 impl Scores {
     fn add(&mut self, name: &'static str, knot: usize, error: Vector3<f64>) {
         let sums = self.squared.entry(name).or_insert_with(|| vec![0.0; 24]);
         sums[knot - 1] += error.norm_squared();
+    }
+
+    /// The best of what needs no model: standing still, going straight on, or half of that.
+    fn simple(&self, knot: usize) -> f64 {
+        let simple = ["hold", "cv", "half cv"].map(|name| self.ratio(name, knot));
+        simple.into_iter().fold(f64::INFINITY, f64::min)
+    }
+
+    /// The share of truths within the region that is to hold 90 %.
+    fn covered(&self, knot: usize) -> f64 {
+        let [judged, within] = self.judged[knot - 1];
+        f64::from(within) / f64::from(judged)
     }
 
     fn ratio(&self, name: &str, knot: usize) -> f64 {
@@ -241,18 +255,26 @@ fn score(model: &Model, reach_m: f64, test: &Demonstration, scores: &mut Scores)
         let sent = WireParams::quantise(&adaptation.params(&state)).dequantise();
         let fused = Forecast::fused(&state, &experts, &sent);
         let mixture = model.posterior(&state);
+        let (velocity, _) = state.motion();
         for j in 1..=model.knots() {
             let h_s = j as f64 * KNOT_SPACING_S;
             if sample.t_s + h_s > end_s {
                 break;
             }
             let truth = test.position_at(sample.t_s + h_s) - sample.position;
-            let [_, generic, straight] = experts.displacement[j - 1];
+            let knot = &fused.ahead.knots[j];
             scores.add("hold", j, truth);
             scores.add("gmr", j, mixture.displacement[j - 1] - truth);
-            scores.add("generic", j, generic - truth);
-            scores.add("straight", j, straight - truth);
-            scores.add("fused", j, fused.ahead.knots[j].displacement - truth);
+            scores.add("generic", j, experts.displacement[j - 1][1] - truth);
+            scores.add("cv", j, velocity * h_s - truth);
+            scores.add("half cv", j, velocity * (0.5 * h_s) - truth);
+            let error = knot.displacement - truth;
+            scores.add("fused", j, error);
+            let [xx, xy, xz, yy, yz, zz] = knot.covariance;
+            let covariance = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz);
+            let nees = error.dot(&(covariance.try_inverse().unwrap() * error));
+            scores.judged[j - 1][0] += 1;
+            scores.judged[j - 1][1] += u32::from(nees < 6.251);
         }
     }
 }
@@ -267,54 +289,79 @@ fn report(set: &str, scores: &Scores) {
     }
 }
 
-/// Ratios to hold at 100, 200 and 300 ms that the mixture alone and the fused experts must reach within 2 %;
-/// returns the latter.
-fn must_reach(set: &str, scores: &Scores, bars: [[f64; 3]; 2]) -> [f64; 3] {
+/// The knots at which predictions are judged: 100, 200 and 300 ms.
+const JUDGED: [usize; 3] = [3, 6, 9];
+
+/// Ratios to hold at 100, 200 and 300 ms that the mixture must reach within 2 %, and those of what the session sends within
+/// 5 %; returns the latter. Fused, the same prediction may not be worse than the best that needs no model by more than 5 %,
+/// and its region of 90 % holds 80 to 99.5 %.
+fn must_reach(set: &str, scores: &Scores, mixture: [f64; 3], fused: [f64; 3]) -> [f64; 3] {
     report(set, scores);
-    for (name, bars) in ["gmr", "fused"].into_iter().zip(bars) {
-        for (knot, bar) in [3, 6, 9].into_iter().zip(bars) {
+    for (name, bar, slack) in [("gmr", mixture, 1.02), ("fused", fused, 1.05)] {
+        for (knot, bar) in JUDGED.into_iter().zip(bar) {
             let ratio = scores.ratio(name, knot);
             assert!(
-                ratio < 1.02 * bar,
+                ratio < slack * bar,
                 "{set}, {name}, knot {knot}: {ratio:.3} against {bar}"
             );
         }
     }
-    [3, 6, 9].map(|knot| scores.ratio("fused", knot))
+    for knot in JUDGED {
+        let simple = scores.simple(knot);
+        let ratio = scores.ratio("fused", knot);
+        assert!(
+            ratio < 1.05 * simple,
+            "{set}, knot {knot}: {ratio:.3} against {simple:.3}"
+        );
+        let held = scores.covered(knot);
+        assert!(
+            (0.8..0.995).contains(&held),
+            "{set}, knot {knot}: {held:.3} of 0.9"
+        );
+    }
+    JUDGED.map(|knot| scores.ratio("fused", knot))
 }
 
 /// The prototype's mixture gives .403/.373/.351, .393/.331/.285, .332/.318/.299, .423/.393/.372 and .517/.504/.528 here.
+/// A clip begins where the hand does: what rests there is soon taken to rest, which costs what is fused the first moments.
 #[test]
 fn gestures_are_predicted_better_than_by_the_prototype() {
     let mut product = [1.0_f64; 3];
-    for (set, bars) in GESTURES {
+    for (set, [mixture, fused]) in GESTURES {
         let Some(folder) = needs(&format!("data/demos/{set}")) else {
             return;
         };
         let scores = evaluate(&by_person(&folder), 3, false);
-        let fused = must_reach(set, &scores, bars);
+        let fused = must_reach(set, &scores, mixture, fused);
         if set.starts_with("utd_mhad") {
             product.iter_mut().zip(fused).for_each(|(p, r)| *p *= r);
         }
     }
     let mean = product.map(|p| p.powf(0.25));
     println!("utd_mhad, geometric mean: {mean:.3?}");
-    for (ratio, bar) in mean.into_iter().zip([0.38, 0.34, 0.32]) {
-        assert!(true || ratio <= 1.01 * bar, "{mean:.3?}");
-    }
 }
 
+/// Of the mixture alone, and fused.
 const GESTURES: [(&str, [[f64; 3]; 2]); 5] = [
-    ("utd_mhad/a03_wave", [[0.388, 0.360, 0.348], [9.0; 3]]),
-    ("utd_mhad/a01_swipe_left", [[0.380, 0.322, 0.284], [9.0; 3]]),
-    ("utd_mhad/a09_circle_cw", [[0.322, 0.307, 0.288], [9.0; 3]]),
+    (
+        "utd_mhad/a03_wave",
+        [[0.388, 0.360, 0.348], [0.417, 0.397, 0.392]],
+    ),
+    (
+        "utd_mhad/a01_swipe_left",
+        [[0.380, 0.322, 0.284], [0.406, 0.355, 0.321]],
+    ),
+    (
+        "utd_mhad/a09_circle_cw",
+        [[0.322, 0.307, 0.288], [0.345, 0.343, 0.332]],
+    ),
     (
         "utd_mhad/a15_tennis_swing",
-        [[0.415, 0.388, 0.370], [9.0; 3]],
+        [[0.415, 0.388, 0.370], [0.442, 0.422, 0.392]],
     ),
     (
         "kard/a01_horizontal_arm_wave",
-        [[0.508, 0.485, 0.507], [9.0; 3]],
+        [[0.508, 0.485, 0.507], [0.514, 0.518, 0.554]],
     ),
 ];
 
@@ -329,7 +376,7 @@ fn other_people_help_where_own_demonstrations_are_few() {
     let alone = evaluate(&groups[..5], 2, false);
     let together = evaluate(&groups[..5], 2, true);
     report(set, &together);
-    for knot in [3, 6, 9] {
+    for knot in JUDGED {
         let (alone, together) = (alone.ratio("gmr", knot), together.ratio("gmr", knot));
         assert!(
             together < 0.97 * alone,
@@ -347,8 +394,63 @@ fn a_smooth_task_is_recognised_and_its_mixture_beats_the_straight_line() {
         return;
     };
     let scores = evaluate(&by_person(&folder), 3, false);
-    must_reach(set, &scores, [[0.065, 0.087, 0.108], [9.0; 3]]);
-    for knot in [3, 6, 9] {
+    must_reach(set, &scores, [0.065, 0.087, 0.108], [0.067, 0.096, 0.122]);
+    for knot in JUDGED {
         assert!(scores.ratio("gmr", knot) < scores.ratio("straight", knot));
+    }
+}
+
+/// Motion that was never demonstrated, of the same person or of another world.
+#[test]
+fn off_the_model_nothing_is_worse_than_standing_still_by_a_tenth() {
+    let sets = [
+        "utd_mhad/a03_wave",
+        "utd_mhad/a09_circle_cw",
+        "robottasks/pouring",
+        "helloworld/e",
+        "kard/a01_horizontal_arm_wave",
+    ];
+    let mut groups = Vec::new();
+    for set in sets {
+        let Some(folder) = needs(&format!("data/demos/{set}")) else {
+            return;
+        };
+        groups.push((set, by_person(&folder)));
+    }
+    let mut all = Scores::default();
+    for (learned, people) in &groups {
+        let mut taught = people[0].clone();
+        taught.truncate(3);
+        let model = train(&taught, &[], &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
+        for (set, people) in groups.iter().filter(|(set, _)| set != learned) {
+            let mut together = Scores::default();
+            for test in people[0].iter().take(2) {
+                let mut one = Scores::default();
+                for scores in [&mut one, &mut together, &mut all] {
+                    score(&model, reach_m(&taught), test, scores);
+                }
+                for knot in JUDGED {
+                    let ratio = one.ratio("fused", knot);
+                    assert!(
+                        ratio < 1.1,
+                        "{learned} on {}, knot {knot}: {ratio:.3}",
+                        test.name()
+                    );
+                }
+            }
+            for knot in JUDGED {
+                let (ratio, simple) = (together.ratio("fused", knot), together.simple(knot));
+                println!("{learned} on {set}, knot {knot}: {ratio:.3}, best simple {simple:.3}");
+                assert!(
+                    ratio < 1.3 * simple,
+                    "{learned} on {set}: {ratio:.3}, {simple:.3}"
+                );
+            }
+        }
+    }
+    for knot in JUDGED {
+        let held = all.covered(knot);
+        println!("knot {knot}: {held:.3} within the region of 0.9");
+        assert!(held > 0.8, "knot {knot}: {held:.3}");
     }
 }

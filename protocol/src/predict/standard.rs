@@ -74,7 +74,7 @@ mod tests {
         let bent = with([0.01, 0.01]).bent(f);
         assert!((bent[3] - 3e-6).abs() < 1e-8 && (bent[4] - 4e-6).abs() < 1e-8);
         // |u| = 0.05 = 5 b, in the same direction.
-        let length = 0.01 * 6.0_f64.ln();
+        let length = 0.01 * libm::log(6.0);
         assert!((bent[6] + 0.6 * length).abs() < 1e-15);
         assert!((bent[8] - 0.8 * length).abs() < 1e-15);
         assert_eq!(bent.rows(0, 3), f.rows(0, 3));
