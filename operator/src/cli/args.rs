@@ -100,7 +100,7 @@ pub struct Args {
     #[arg(long)]
     pub gain: Option<f64>,
     /// ε_future: when the robot's prediction would be off by more, the operator speaks; a length (40mm, 0.04m) or a
-    /// multiple of the predicted deviation (0.6sigma) [default: 0.6sigma].
+    /// multiple of the predicted deviation (0.6sigma) [default: 1sigma].
     #[arg(long, value_name = "BOUND", value_parser = parse_future_bound)]
     pub future_bound: Option<FutureBound>,
     /// ε_path, m: the robot's record of the path is that exact [default: 2 % of the skill's reach].
