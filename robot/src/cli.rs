@@ -1,17 +1,18 @@
 //! The robot daemon's command line: flags over a TOML file over defaults.
 
+mod record;
+mod report;
+
 use std::io::IsTerminal;
-use std::io::Write as _;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 use std::time::Duration;
 
-use anyhow::{Context, bail};
-use serde::{Deserialize, Serialize};
+use anyhow::Context;
+use serde::Deserialize;
 use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
-use telemime_endpoint::pairing::{Candidate, Own};
+use telemime_endpoint::pairing::Own;
 use telemime_endpoint::peers::{Role, Source, Whom};
 use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Trust, quic};
 use telemime_sim::arm::LoadOptions;
@@ -21,11 +22,14 @@ use tokio::sync::mpsc;
 use crate::clock::Origin;
 use crate::control::ControlConfig;
 use crate::daemon::{Daemon, Notice};
-use crate::desk::{Desk, Progress};
+use crate::desk::Desk;
 use crate::refused::Refused;
 use crate::rig::{Rig, RigOptions};
-use crate::servo::{self, Report, Ticket};
+use crate::servo::{self, Ticket};
 use crate::session::SessionConfig;
+use record::Recorder;
+pub use report::Event;
+use report::{Log, engaged, nth};
 
 /// Drive an arm for an operator.
 ///
@@ -127,75 +131,6 @@ fn parse_fixed(text: &str) -> Result<(String, f64), String> {
         .parse::<f64>()
         .map_err(|e| format!("`{value}`: {e}"))?;
     Ok((joint.to_owned(), value))
-}
-
-/// What the robot prints with `--json`; `docs/commands.md` lists the fields.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "event", rename_all = "snake_case")]
-#[expect(
-    missing_docs,
-    reason = "the fields are documented where users look: docs/commands.md"
-)]
-pub enum Event {
-    Listening {
-        addr: SocketAddr,
-        fingerprint: String,
-        arm: String,
-        joints: usize,
-        lag_s: f64,
-        radius_m: f64,
-    },
-    Connected {
-        epoch: u32,
-        version: u16,
-        peer: SocketAddr,
-    },
-    Disconnected {
-        why: String,
-        received: u32,
-        dropped: u32,
-        clock_offset_s: Option<f64>,
-        clock_bound_s: Option<f64>,
-        clock_origin: String,
-    },
-    Refused {
-        reason: String,
-        peer: SocketAddr,
-        why: String,
-        times: u32,
-    },
-    Pairing {
-        stage: String,
-        seconds: Option<f64>,
-        name: Option<String>,
-        fingerprint: Option<String>,
-        code: Option<String>,
-        why: Option<String>,
-    },
-    State {
-        state: String,
-        cause: String,
-        mono_ns: i64,
-    },
-    Engaged {
-        engagement: u32,
-        mono_ns: i64,
-        scale: f64,
-        rotation: [f64; 4],
-        hand_m: [f64; 3],
-        tip_m: [f64; 3],
-        hand_q: Option<[f64; 4]>,
-        tip_q: [f64; 4],
-    },
-    Path {
-        knots: Vec<(f64, [f64; 3], [f64; 3], bool)>,
-    },
-    Servo {
-        ticks: u64,
-        mean_ns: u32,
-        p99_ns: u32,
-        overruns: u32,
-    },
 }
 
 /// Runs the daemon until it is told to stop.
@@ -381,68 +316,6 @@ fn read_config(path: &Path) -> anyhow::Result<File> {
     toml::from_str(&text).map_err(|e| anyhow::anyhow!("{}: {e}", path.display()))
 }
 
-#[derive(Clone)]
-struct Log {
-    json: bool,
-    out: Printer,
-}
-
-impl Log {
-    fn say(&self, event: &Event, text: impl FnOnce() -> String) {
-        if self.json {
-            self.out.emit(event);
-        } else {
-            self.out.say(text());
-        }
-    }
-
-    fn pairing(&self, progress: &Progress) {
-        let (stage, candidate) = match progress {
-            Progress::Open(_) => ("open", None),
-            Progress::TooSoon(_) => ("too_soon", None),
-            Progress::Code(candidate) => ("code", Some(candidate)),
-            Progress::Paired(candidate) => ("paired", Some(candidate)),
-            Progress::Ended(_) => ("ended", None),
-            Progress::Nothing => ("nothing", None),
-        };
-        let (seconds, why) = match progress {
-            Progress::Open(span) | Progress::TooSoon(span) => (Some(span.as_secs_f64()), None),
-            Progress::Ended(why) => (None, Some(why.to_string())),
-            _ => (None, None),
-        };
-        let text = || match progress {
-            Progress::Open(span) => format!(
-                "pairing: the window is open for {:.0} s and one attempt; at the operator, run telemime pair HOST:PORT",
-                span.as_secs_f64()
-            ),
-            Progress::TooSoon(span) => {
-                format!(
-                    "pairing: too soon after the last window; wait {:.0} s",
-                    span.as_secs_f64().ceil()
-                )
-            }
-            Progress::Code(Candidate { name, key, code }) => format!(
-                "pairing: operator {name}, key {}\n\n    {code}\n\nDoes the operator show the same? Type yes or no.",
-                key.short()
-            ),
-            Progress::Paired(Candidate { name, key, .. }) => {
-                format!("pairing: operator {name} is trusted from now on\nfingerprint {key}")
-            }
-            Progress::Ended(why) => format!("pairing: ended without one: {why}"),
-            Progress::Nothing => "pairing: there is nothing to say yes or no to".to_owned(),
-        };
-        let event = Event::Pairing {
-            stage: stage.to_owned(),
-            seconds,
-            name: candidate.map(|c| c.name.to_string()),
-            fingerprint: candidate.map(|c| c.key.to_string()),
-            code: candidate.map(|c| c.code.to_string()),
-            why,
-        };
-        self.say(&event, text);
-    }
-}
-
 async fn listen_to(
     mut heard: mpsc::UnboundedReceiver<Notice>,
     log: Log,
@@ -544,96 +417,6 @@ async fn listen_to(
         }
     }
     recorder
-}
-
-/// How often somebody was turned away, if not for the first time.
-fn nth(times: u32) -> String {
-    if times > 1 {
-        format!(" (for the {times}th time)")
-    } else {
-        String::new()
-    }
-}
-
-fn engaged(report: &Report) -> Event {
-    let scalar_first = |q: &nalgebra::UnitQuaternion<f64>| [q.w, q.i, q.j, q.k];
-    Event::Engaged {
-        engagement: report.engagement.number,
-        mono_ns: report.engaged_at.0,
-        scale: report.mapping.scale,
-        rotation: scalar_first(&report.mapping.rotation),
-        hand_m: report.mapping.hand_m.into(),
-        tip_m: report.mapping.tip_m.into(),
-        hand_q: report.mapping.hand_orientation.as_ref().map(scalar_first),
-        tip_q: scalar_first(&report.mapping.tip_orientation),
-    }
-}
-
-/// Ticks on their way to the disk; a slow disk loses ticks, never the servo's time.
-const QUEUE: usize = 8192;
-
-/// Writes ticks to a CSV file from a thread of its own.
-struct Recorder {
-    path: PathBuf,
-    queue: SyncSender<Report>,
-    thread: std::thread::JoinHandle<std::io::Result<()>>,
-    lost: u64,
-}
-
-impl Recorder {
-    fn start(path: &Path, dof: usize) -> anyhow::Result<Self> {
-        let file = std::fs::File::create(path)
-            .with_context(|| format!("cannot write {}", path.display()))?;
-        let (queue, reports) = sync_channel::<Report>(QUEUE);
-        let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
-            let mut out = std::io::BufWriter::new(file);
-            write!(out, "tick,mono_ns,state,engagement,age_s,clamps,tip_x,tip_y,tip_z,target_x,target_y,target_z,tip_qw,tip_qx,tip_qy,tip_qz,opening,jerk")?;
-            (0..dof).try_for_each(|i| write!(out, ",q{i}"))?;
-            writeln!(out)?;
-            for r in reports {
-                write!(out, "{},{},{:?},{},{:.6},{}", r.tick, r.at.0, r.state, r.engagement.number, r.age_s, r.clamps)?;
-                let q = &r.orientation;
-                let turn = [q.w, q.i, q.j, q.k, r.opening, r.jerk_m_s3];
-                r.tip_m.iter().chain(&r.target_m).chain(&turn).try_for_each(|v| write!(out, ",{v:.6}"))?;
-                r.q.iter().take(dof).try_for_each(|v| write!(out, ",{v:.6}"))?;
-                writeln!(out)?;
-            }
-            out.flush()
-        })?;
-        Ok(Self {
-            path: path.to_owned(),
-            queue,
-            thread,
-            lost: 0,
-        })
-    }
-
-    fn take(&mut self, report: &Report) {
-        if let Err(TrySendError::Full(_)) = self.queue.try_send(*report) {
-            self.lost += 1;
-        }
-    }
-
-    fn finish(self) -> anyhow::Result<()> {
-        let Self {
-            path,
-            queue,
-            thread,
-            lost,
-        } = self;
-        drop(queue);
-        match thread.join() {
-            Ok(written) => written.with_context(|| format!("cannot write {}", path.display()))?,
-            Err(_) => bail!("the recorder of {} failed", path.display()),
-        }
-        if lost > 0 {
-            eprintln!(
-                "note: {lost} ticks are missing in {}: the disk was too slow",
-                path.display()
-            );
-        }
-        Ok(())
-    }
 }
 
 #[cfg(test)]

@@ -122,7 +122,7 @@ fn a_plan_whose_operator_falls_silent_is_not_played_on() {
         let last = reports.last().unwrap();
         assert_eq!(last.cause, Cause::LeaseExpired);
         let rested = |r: &Report| (r.tip_m - last.tip_m).norm() < 1e-4;
-        assert!(reports.iter().rev().take(3000).all(rested));
+        assert!(reports.iter().rev().take(2800).all(rested));
         let mut engagements = 0;
         while let Ok(notice) = operator.notices.try_recv() {
             engagements += u32::from(matches!(notice, Notice::Event(_, Event::Engaged { .. })));

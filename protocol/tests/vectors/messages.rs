@@ -3,7 +3,6 @@
 use serde::Serialize;
 use serde_json::json;
 use telemime_protocol::checkpoint::path::{PathGrid, PathKnot, tick_of};
-use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
@@ -227,21 +226,6 @@ fn motion(draw: &mut Draw, knot_count: usize) -> Motion {
     }
 }
 
-fn bend(draw: &mut Draw, i: usize) -> Option<WireBend> {
-    let held = WireHeld {
-        state: draw.state(),
-        gain: draw.u8(),
-        straight: draw.u8(),
-        weight: [127, -63, 0, 63, 1, 64],
-    };
-    (i > 0).then(|| WireBend {
-        plan_us: draw.signed(40),
-        rate: [0, 128, 192][i % 3],
-        left: [draw.signed(18) as i32, 0, -1_000_000],
-        held: (i > 1).then_some(held),
-    })
-}
-
 fn telemetry(draw: &mut Draw) -> Telemetry {
     Telemetry {
         epoch: draw.u32(),
@@ -412,7 +396,6 @@ pub(crate) fn messages() -> Vec<Vector> {
             t_us: draw.signed(53),
             lease_ms: draw.u16(),
             bend: draw.maybe(Draw::bend),
-            bend: bend(draw, i),
         };
         let pong = OperatorDatagram::Pong {
             epoch: draw.u32(),
