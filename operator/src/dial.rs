@@ -264,7 +264,7 @@ mod tests {
         for (rtt, brisk) in [
             (None, 500),
             (Some(20), 500),
-            (Some(125), 500),
+            (Some(125), 520),
             (Some(600), 2420),
             (Some(60_000), 10_000),
         ] {

@@ -456,6 +456,8 @@ mod tests {
             .and_then(|rest| rest.split("```").next())
             .unwrap()
             .replace("# play", "play")
+            .replace("# correct", "correct")
+            .replace("# hand_sigma_m", "hand_sigma_m")
             .replace("# bound_m", "bound_m")
             .replace("# turn_bound_rad", "turn_bound_rad");
         let file: File = toml::from_str(&example).unwrap();
