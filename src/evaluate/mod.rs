@@ -78,9 +78,9 @@ pub(crate) struct Args {
     /// The recordings' axes, as the arm is to see them.
     #[arg(long, value_enum, default_value_t = Axes::Kinect, requires = "arm")]
     axes: Axes,
-    /// Sessions take every sample for real (see `telemime operator`).
+    /// Sessions replace what looks like a tracker's glitch (see `telemime operator`).
     #[arg(long)]
-    no_glitch_gate: bool,
+    glitch_gate: bool,
     /// Draw what was found (.svg or .png).
     #[arg(long, value_name = "FILE")]
     figure: Option<PathBuf>,
@@ -123,7 +123,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     }
     let schemes = schemes(&sets, link.delay_s);
     let session = SessionConfig {
-        glitch_gate: !args.no_glitch_gate,
+        glitch_gate: args.glitch_gate,
         rotation: args.axes.rotation(),
         ..SessionConfig::default()
     };
