@@ -6,8 +6,9 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
-use telemime_endpoint::HostClock;
 use telemime_endpoint::cli::{self as shell, one_line};
+use telemime_endpoint::peers::Role;
+use telemime_endpoint::{HostClock, admin};
 use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
 
 use crate::relay::{Passage, Relay, RelayConfig};
@@ -52,6 +53,9 @@ enum Command {
     Operator(Box<telemime_operator::cli::Args>),
     /// The robot daemon: an arm that follows.
     Robot(telemime_robot::cli::Args),
+    Identity(admin::IdentityArgs),
+    Pair(telemime_operator::cli::PairArgs),
+    Peers(admin::PeersArgs),
     /// Measure the input's latency from taps on a table.
     Tap(tap::Args),
     /// A UDP relay that delays, loses and throttles what passes.
@@ -126,6 +130,9 @@ pub fn main() -> ExitCode {
         Some(Command::Tap(args)) => tap::run(args),
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),
+        Some(Command::Identity(args)) => admin::identity(args, Role::Operator),
+        Some(Command::Pair(args)) => telemime_operator::cli::pair(args),
+        Some(Command::Peers(args)) => admin::peers(args),
         Some(Command::Link(args)) => link(args),
         Some(Command::Paper(args)) => paper::run(args),
     };

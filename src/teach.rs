@@ -36,6 +36,10 @@ pub(crate) struct LearnArgs {
         conflicts_with = "update"
     )]
     frames: Vec<String>,
+    /// The same motion by other people, same format: where the own demonstrations have nothing to say, the predictor leans
+    /// on what these have in common with them. Own recordings found there are passed over.
+    #[arg(long, value_name = "DIR", conflicts_with = "update")]
+    others: Option<PathBuf>,
     /// Refine this skill; each new demonstration weighs as much as each it was learned from.
     #[arg(long, value_name = "SKILL")]
     update: Option<PathBuf>,
@@ -83,6 +87,20 @@ fn share(text: &str) -> Result<f64, String> {
     share.ok_or_else(|| format!("`{text}` is not a share from 0 to below 1"))
 }
 
+/// The recordings in `dir` that are not among the own ones.
+fn others(dir: &Path, own: &[Demonstration]) -> anyhow::Result<Vec<Demonstration>> {
+    let mut found = Demonstrations::read_dir(dir, None)?;
+    let is_own = |d: &Demonstration| own.iter().any(|own| own.sha256() == d.sha256());
+    found.demonstrations.retain(|d| !is_own(d));
+    if found.demonstrations.is_empty() {
+        bail!(
+            "{}: nothing but the own recordings; give a folder of other people's, or leave out --others",
+            dir.display()
+        );
+    }
+    Ok(found.demonstrations)
+}
+
 pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
     if let Some(old) = &args.update {
         return update(args, old);
@@ -98,9 +116,14 @@ pub(crate) fn learn(args: &LearnArgs) -> anyhow::Result<()> {
         .notices
         .iter()
         .for_each(|notice| eprintln!("note: {notice}"));
+    let others = match &args.others {
+        Some(dir) => others(dir, &found.demonstrations)?,
+        None => Vec::new(),
+    };
     let options = LearnOptions {
         seed: args.seed,
         frames: args.frames.clone(),
+        others,
         ..LearnOptions::default()
     };
     let bar = ProgressBar::new_spinner();

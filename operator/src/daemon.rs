@@ -10,34 +10,34 @@ use std::time::Duration;
 
 use quinn::{Connection, Endpoint, VarInt};
 use telemime_endpoint::cli::{Word, told};
-use telemime_endpoint::control::{Control, ControlError, Writer};
+use telemime_endpoint::control::ControlError;
 use telemime_endpoint::meter::Counts;
-use telemime_endpoint::{HostClock, Meter, Mono, quic};
+use telemime_endpoint::{
+    External, Fingerprint, HostClock, Meter, Mono, Standing, Trust, quic, trust,
+};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
-use telemime_protocol::wire::frame::Frame;
-use telemime_protocol::wire::hello::{Answer, RejectCode};
+use telemime_protocol::wire::hello::RejectCode;
 use telemime_protocol::wire::{DecodeError, Version};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{sleep_until, timeout};
 
+use crate::dial::{DialError, Dialler, Link, Seen};
 use crate::lessons::{Lesson, LessonError, Lessons};
 use crate::recognise::Recogniser;
 use crate::session::{Counters, Event, Output, Session, SessionConfig};
 use crate::task::{Advice, Outcome, Task};
 
-/// The first attempt to connect is given this long; later ones twice as long each.
-const FIRST_ATTEMPT: Duration = Duration::from_secs(1);
-const LONGEST_ATTEMPT: Duration = Duration::from_secs(10);
-
-/// Pause between attempts.
-const REDIAL_S: f64 = 0.25;
+/// A robot that has ended its stream gets this long to say why.
+const LAST_WORDS: Duration = Duration::from_millis(500);
 
 /// What the daemon needs.
 #[derive(Debug)]
 pub struct Daemon {
-    /// A client endpoint whose default settings pin the robot's key.
+    /// A client endpoint whose default settings trust whom `trust` does.
     pub endpoint: Endpoint,
+    /// The robot's key, and whether it still is trusted.
+    pub trust: Trust,
     /// Counts the endpoint's traffic.
     pub meter: Meter,
     /// The robot.
@@ -46,6 +46,8 @@ pub struct Daemon {
     pub clock: HostClock,
     /// Zero of the session clock.
     pub epoch: Mono,
+    /// A clock that is kept right from outside, if there is one.
+    pub external: Option<External>,
     /// What to predict with.
     pub skill: Option<Arc<Skill>>,
     /// Says which skill the hand performs, if anybody wants to know.
@@ -87,6 +89,26 @@ pub enum DaemonError {
         code: RejectCode,
         /// Why, for people.
         text: String,
+    },
+    /// Another key answers than the one that is pinned.
+    #[error(
+        "the robot at {addr} has another key than the one we know: it shows {}. Either it was set up anew, or somebody \
+         is in between; nothing was sent. If it was on purpose, run `telemime peers remove` for the old key and pair again",
+        shown.map_or_else(|| "none we can read".to_owned(), |key| key.to_string())
+    )]
+    KeyChanged {
+        /// Its address.
+        addr: SocketAddr,
+        /// What it shows.
+        shown: Option<Fingerprint>,
+    },
+    /// The robot has revoked our key.
+    #[error(
+        "the robot at {addr} has revoked our key: it must be removed there (`telemime peers remove`) before it can be paired again"
+    )]
+    Revoked {
+        /// Its address.
+        addr: SocketAddr,
     },
 }
 
@@ -160,13 +182,8 @@ pub enum Notice {
     },
 }
 
-struct Link {
-    connection: Connection,
-    writer: Writer,
-    frames: mpsc::Receiver<Result<Frame, ControlError>>,
-    epoch: u32,
-    version: Version,
-}
+const NOT_HERE: &str =
+    "an operator is paired by `telemime pair HOST:PORT`, a robot on its own terminal";
 
 /// What the person at the terminal says.
 struct Console<'a> {
@@ -188,6 +205,7 @@ impl Console<'_> {
                         "there is no link: the emergency stop is the first thing the robot will hear"
                     }
                     Word::Reset => "there is no link: the reset is discarded",
+                    Word::Pair(_) | Word::Yes | Word::No => NOT_HERE,
                     Word::Keep | Word::Refine | Word::Save(_) => {
                         "there is no link: say it again when it is back"
                     }
@@ -200,11 +218,6 @@ impl Console<'_> {
     fn note(&self, text: impl Into<Cow<'static, str>>) {
         let _ = self.notices.send(Notice::Note(text.into()));
     }
-}
-
-enum DialError {
-    Again(String),
-    Rejected { code: RejectCode, text: String },
 }
 
 enum End {
@@ -236,6 +249,7 @@ impl Daemon {
         let mut lessons = Lessons::new(self.skill.clone());
         // Demanded, and not confirmed by the robot: outlives the session it was demanded in.
         let mut stop = false;
+        let mut seen = None;
         loop {
             let mut hung_up = quit.clone();
             let mut console = Console {
@@ -246,9 +260,10 @@ impl Daemon {
             let link = tokio::select! {
                 biased;
                 () = told(&mut hung_up) => break,
-                link = self.dial(summary.sessions == 0, task, &mut console, &mut stop) => link?,
+                link = self.dial(seen, task, &mut console, &mut stop) => link?,
             };
             let Some(link) = link else { break };
+            let (mut last, connection) = (link.seen(), link.connection.clone());
             summary.sessions += 1;
             let _ = notices.send(Notice::Connected {
                 epoch: link.epoch,
@@ -264,6 +279,9 @@ impl Daemon {
             let end = self
                 .drive(&mut session, link, task, console, &mut marks, &mut lessons)
                 .await;
+            last.rtt = connection.rtt();
+            drop(connection);
+            seen = Some(last);
             stop = session.stop_is_unconfirmed();
             summary.counters.add(session.counters());
             match end {
@@ -300,84 +318,56 @@ impl Daemon {
     }
 
     /// Dials until there is a session; `None` once the task is over anyway and no `stop` has to be delivered.
+    /// `seen` is what the last session's link was like, if there was one.
     async fn dial(
         &self,
-        first: bool,
+        seen: Option<Seen>,
         task: &Task,
         console: &mut Console<'_>,
         stop: &mut bool,
     ) -> Result<Option<Link>, DaemonError> {
-        let begun = self.now();
-        let mut attempt = FIRST_ATTEMPT;
+        let (begun, first, addr) = (self.now(), seen.is_none(), self.robot);
+        let mut dialler = Dialler::new(&self.endpoint, addr, self.config.versions, seen);
+        let mut said = None;
         loop {
-            let dialled = console.beside(stop, timeout(attempt, self.connect())).await;
-            attempt = (attempt * 2).min(LONGEST_ATTEMPT);
+            let outcome = console.beside(stop, dialler.next()).await;
             let patient = self.now().secs_since(begun) <= self.patience.as_secs_f64();
-            let why = match dialled {
-                Ok(Ok(link)) => return Ok(Some(link)),
+            let why = match outcome {
+                Some(Ok(link)) => return Ok(Some(link)),
+                None => None,
+                Some(Err(DialError::Again(why))) => Some(why),
                 // An operator that lost its link, or comes back, may find its own old session still in authority.
-                Ok(Err(DialError::Rejected {
+                Some(Err(DialError::Rejected {
                     code: RejectCode::Busy,
                     text,
-                })) if !first || patient => text,
-                Ok(Err(DialError::Rejected { code, text })) => {
-                    return Err(DaemonError::Rejected {
-                        addr: self.robot,
-                        code,
-                        text,
-                    });
+                })) if !first || patient => Some(text),
+                Some(Err(DialError::Rejected { code, text })) => {
+                    return Err(DaemonError::Rejected { addr, code, text });
                 }
-                Ok(Err(DialError::Again(why))) => why,
-                Err(_) => "no answer: is the robot running, and does UDP reach it?".to_owned(),
+                Some(Err(DialError::KeyChanged)) => {
+                    let shown = self.trust.turned_away();
+                    let changed = DaemonError::KeyChanged { addr, shown };
+                    if first {
+                        return Err(changed);
+                    }
+                    // Whoever answers in its place now need not be there for long.
+                    Some(changed.to_string())
+                }
+                Some(Err(DialError::Revoked)) => return Err(DaemonError::Revoked { addr }),
             };
             if first && !patient {
-                return Err(DaemonError::Unreachable {
-                    addr: self.robot,
-                    why,
-                });
+                let why = why.or(said);
+                let why = why.unwrap_or_else(|| "no answer".into());
+                return Err(DaemonError::Unreachable { addr, why });
             }
             if task.is_over(self.now()) && !*stop {
                 return Ok(None);
             }
-            let _ = console.notices.send(Notice::Dialling { why });
-            let again = self.instant(self.now().offset_by_secs(REDIAL_S));
-            console.beside(stop, sleep_until(again)).await;
-        }
-    }
-
-    async fn connect(&self) -> Result<Link, DialError> {
-        let again = |e: ControlError| DialError::Again(e.to_string());
-        let connecting = self
-            .endpoint
-            .connect(self.robot, "telemime")
-            .map_err(|e| DialError::Again(e.to_string()))?;
-        let connection = connecting
-            .await
-            .map_err(|e| DialError::Again(quic::explain(&e)))?;
-        let mut control = Control::open(&connection).await.map_err(again)?;
-        let offered = self.config.versions;
-        control
-            .write(&offered.hello().encode())
-            .await
-            .map_err(again)?;
-        match control.answer().await.map_err(again)? {
-            Answer::Ack { version, epoch, .. } => {
-                let Some(version) = offered.known(version) else {
-                    return Err(DialError::Rejected {
-                        code: RejectCode::Version,
-                        text: format!("it answers with version {version}, which we did not offer"),
-                    });
-                };
-                let (writer, frames) = control.into_frames();
-                Ok(Link {
-                    connection,
-                    writer,
-                    frames,
-                    epoch,
-                    version,
-                })
+            if why.is_some() && why != said {
+                said.clone_from(&why);
+                let why = why.unwrap_or_default();
+                let _ = console.notices.send(Notice::Dialling { why });
             }
-            Answer::Reject { code, text } => Err(DialError::Rejected { code, text }),
         }
     }
 
@@ -391,6 +381,7 @@ impl Daemon {
         lessons: &mut Lessons,
     ) -> End {
         let notices = console.notices;
+        let key = trust::key_of(&link.connection);
         loop {
             if let Err(e) = self.flush(session, &link, marks) {
                 return End::Lost(e.to_string());
@@ -458,10 +449,18 @@ impl Daemon {
                     let _ = self.leave(session, link, marks).await;
                     return End::Quit;
                 }
+                standing = self.withdrawn(key) => {
+                    let _ = self.leave(session, link, marks).await;
+                    return End::Lost(match standing {
+                        Standing::Revoked => "the robot's key was revoked".into(),
+                        Standing::Trusted | Standing::Unknown => "the robot's key is not trusted any more".into(),
+                    });
+                }
                 Some(word) = console.words.recv() => match word {
                     Word::Stop => session.stop(self.now()),
                     Word::Reset if session.reset() => {}
                     Word::Reset => console.note("the reset is discarded: the robot has not confirmed the stop yet"),
+                    Word::Pair(_) | Word::Yes | Word::No => console.note(NOT_HERE),
                     word @ (Word::Keep | Word::Refine | Word::Save(_)) => {
                         let said = self.lesson(&word, session, lessons, notices);
                         if let Err(e) = said {
@@ -480,11 +479,14 @@ impl Daemon {
                             return End::Lost(malformed(&link.connection, &e));
                         }
                     }
-                    Some(Err(e)) => return End::Lost(e.to_string()),
-                    None => return End::Lost("control stream ended".into()),
+                    Some(Err(e)) => return End::Lost(last_words(&link.connection, e.to_string()).await),
+                    None => return End::Lost(last_words(&link.connection, "control stream ended".into()).await),
                 },
                 datagram = link.connection.read_datagram() => match datagram {
-                    Ok(bytes) => session.handle_datagram(self.now(), &bytes),
+                    Ok(bytes) => {
+                        session.set_external(self.external.as_ref().map(|e| e.message(self.epoch)));
+                        session.handle_datagram(self.now(), &bytes);
+                    }
                     Err(e) => return End::Lost(quic::explain(&e)),
                 },
                 () = sleep_until(self.instant(due.unwrap_or(now))), if due.is_some() => {
@@ -492,6 +494,14 @@ impl Daemon {
                     session.handle_timeout(now);
                 }
             }
+        }
+    }
+
+    /// Resolves once the robot's key is not trusted any more.
+    async fn withdrawn(&self, key: Option<Fingerprint>) -> Standing {
+        match key {
+            Some(key) => self.trust.withdrawn(key).await,
+            None => Standing::Unknown,
         }
     }
 
@@ -512,7 +522,7 @@ impl Daemon {
                 lessons.save(file)?;
                 let _ = notices.send(Notice::Saved(file.clone()));
             }
-            Word::Stop | Word::Reset => {}
+            Word::Stop | Word::Reset | Word::Pair(_) | Word::Yes | Word::No => {}
         }
         Ok(())
     }
@@ -595,6 +605,12 @@ impl Daemon {
         connection.close(VarInt::from_u32(0), b"goodbye");
         End::Finished
     }
+}
+
+/// A robot that ends a session ends its stream first, and says why when it closes.
+async fn last_words(connection: &Connection, otherwise: String) -> String {
+    let closed = timeout(LAST_WORDS, connection.closed()).await;
+    closed.map_or(otherwise, |why| quic::explain(&why))
 }
 
 fn malformed(connection: &Connection, error: &DecodeError) -> String {

@@ -65,6 +65,15 @@ const QUATERNION: [&str; 4] = ["qw", "qx", "qy", "qz"];
 /// A quaternion's norm may be off by this much: it is written with a few digits.
 const NORM_SLACK: f64 = 0.01;
 
+/// What the times of a recording mean.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Times {
+    /// Only their differences: they count from the first sample, and long holes are refused.
+    FromFirst,
+    /// What is written.
+    AsWritten,
+}
+
 /// One performance of a skill: at least [`LEAST_SAMPLES`] finite samples, time strictly ascending.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Demonstration {
@@ -83,12 +92,24 @@ impl Demonstration {
     /// # Errors
     /// [`DemonstrationError`], one variant a cause.
     pub fn read_csv(path: impl AsRef<Path>) -> Result<Self, DemonstrationError> {
-        let path = path.as_ref();
+        Self::read(path.as_ref(), Times::FromFirst)
+    }
+
+    /// Reads what a hand did beside a motion that is played: times are kept, s from its beginning, and holes are where
+    /// the hand was not there.
+    ///
+    /// # Errors
+    /// As [`Demonstration::read_csv`], holes of any length allowed.
+    pub fn read_beside(path: impl AsRef<Path>) -> Result<Self, DemonstrationError> {
+        Self::read(path.as_ref(), Times::AsWritten)
+    }
+
+    fn read(path: &Path, times: Times) -> Result<Self, DemonstrationError> {
         let bytes = fs::read(path).map_err(|source| DemonstrationError::Io {
             path: path.to_owned(),
             source,
         })?;
-        Self::parse(path, &bytes)
+        Self::parse_as(path.to_owned(), &bytes, times)
     }
 
     /// Parses the content of a CSV file; `path` names it, and need not exist.
@@ -96,7 +117,10 @@ impl Demonstration {
     /// # Errors
     /// As [`Demonstration::read_csv`].
     pub fn parse(path: impl Into<PathBuf>, bytes: &[u8]) -> Result<Self, DemonstrationError> {
-        let path = path.into();
+        Self::parse_as(path.into(), bytes, Times::FromFirst)
+    }
+
+    fn parse_as(path: PathBuf, bytes: &[u8], times: Times) -> Result<Self, DemonstrationError> {
         let mut reader = csv::ReaderBuilder::new()
             .trim(csv::Trim::All)
             .comment(Some(b'#'))
@@ -126,7 +150,7 @@ impl Demonstration {
 
         let mut samples: Vec<Sample> = Vec::new();
         // Recordings stamped since 1970 are as good as any: only differences mean something.
-        let mut zero_s = None;
+        let mut zero_s = (times == Times::AsWritten).then_some(0.0);
         let mut record = csv::StringRecord::new();
         while reader
             .read_record(&mut record)
@@ -168,7 +192,7 @@ impl Demonstration {
                 });
             }
             let gap_s = samples.last().map_or(0.0, |last| t_s - last.t_s);
-            if gap_s > LONGEST_GAP_S {
+            if gap_s > LONGEST_GAP_S && times == Times::FromFirst {
                 return Err(DemonstrationError::Gap { path, line, gap_s });
             }
             let orientation = match &turn {
@@ -256,6 +280,33 @@ impl Demonstration {
         samples: &[Sample],
     ) -> Result<Self, DemonstrationError> {
         Self::parse(name, csv_text(&[], samples).as_bytes())
+    }
+
+    /// The same path in 1/`pace` of the time, sampled evenly at the mean rate of this one; name and hash stay.
+    pub(crate) fn paced(&self, pace: f64) -> Self {
+        let step_s = self.duration_s() / (self.samples.len() - 1) as f64;
+        let steps = (self.duration_s() / (pace * step_s)).floor() as usize;
+        let at = |i: usize| {
+            let t_s = i as f64 * step_s;
+            let own_s = self.samples[0].t_s + t_s * pace;
+            Sample {
+                t_s,
+                position: self.position_at(own_s),
+                orientation: self.orientation_at(own_s),
+                grip: self.grip_at(own_s),
+            }
+        };
+        Self {
+            samples: (0..=steps).map(at).collect(),
+            ..self.clone()
+        }
+    }
+
+    /// The same motion, `by` (m) from here; name, hash and frames stay.
+    pub(crate) fn shifted(&self, by: &Vector3<f64>) -> Self {
+        let mut copy = self.clone();
+        copy.samples.iter_mut().for_each(|s| s.position += by);
+        copy
     }
 
     /// Whether every sample has an orientation.

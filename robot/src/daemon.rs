@@ -3,19 +3,23 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use quinn::{Connection, Endpoint, Incoming, VarInt};
+use quinn::{Connection, ConnectionError, Endpoint, Incoming, VarInt};
 use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{Control, ControlError, Writer};
-use telemime_endpoint::{HostClock, quic};
+use telemime_endpoint::{External, Fingerprint, HostClock, Mono, Standing, Trust, quic, trust};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::wire::Version;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
+use telemime_protocol::wire::pair;
 use telemime_protocol::wire::v1::{Cause, Info, RobotState};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep_until};
 
+use crate::clock::Origin;
+use crate::desk::{Desk, Progress};
 use crate::door::{self, Door, Place, Verdict};
+use crate::refused::{Reason, Refused, Tally};
 use crate::servo::thread::Timing;
 use crate::servo::{Handle, Order, Report};
 use crate::session::{Counters, Output, Session, SessionConfig, TickTiming};
@@ -29,6 +33,7 @@ const MALFORMED: u32 = 1;
 const REJECTED: u32 = 2;
 const BAD_GREETING: u32 = 3;
 const FAULT: u32 = 4;
+const NOT_TRUSTED: u32 = 5;
 
 /// What is still to be said when a session ends gets this long.
 const LAST_WORDS: Duration = Duration::from_millis(500);
@@ -38,6 +43,13 @@ const MAX_SILENT_DRAINS: u32 = 125;
 
 /// A stop takes a fraction of a second; after this many drains (2 s) the servo itself must be dead.
 const MAX_STOP_DRAINS: u32 = 500;
+
+/// An operator that comes back takes its own old session's place once that has been silent for two keep-alives:
+/// its connection is dead, and only its time-out does not know yet.
+const HALF_OPEN_S: f64 = 2.0 * quic::KEEP_ALIVE.as_millis() as f64 * 1e-3;
+
+/// An operator's longest attempt to connect.
+const OVERLAP_S: f64 = 10.0;
 
 /// What the daemon needs.
 #[derive(Debug)]
@@ -54,6 +66,10 @@ pub struct Daemon {
     servo: Handle,
     /// The servo's timing, where it has a thread of its own.
     timing: Option<Arc<Timing>>,
+    /// Whom it trusts, and how that grows.
+    desk: Desk,
+    external: Option<External>,
+    refused: Tally,
     silent_drains: u32,
 }
 
@@ -75,14 +91,15 @@ pub enum Notice {
         why: String,
         /// The clock's offset estimate, s, and the bound of its error, s.
         clock: Option<(f64, f64)>,
+        /// Where that came from.
+        origin: Origin,
         /// What the session counted.
         counters: Counters,
     },
-    /// Somebody was turned away.
-    Refused {
-        /// Why.
-        why: String,
-    },
+    /// Somebody was turned away: told the first time, and then ever more rarely.
+    Refused(Refused),
+    /// A pairing makes progress.
+    Pairing(Progress),
     /// A servo tick, for recording.
     Report(Box<Report>),
     /// The path an engagement received, as it stands when the session ends: time (s, session clock), m, m/s, and
@@ -92,13 +109,29 @@ pub enum Notice {
 
 struct Greeted {
     connection: Connection,
+    key: Fingerprint,
     control: Control,
     hello: Hello,
+}
+
+/// What became of a connection that somebody opened.
+enum Arrival {
+    Greeted(Box<Greeted>),
+    /// It wants to be paired.
+    Pairing(Connection),
+    /// Turned away already.
+    Refused(std::net::SocketAddr, Reason, String),
+    /// It went by itself before it had said anything: an attempt that overlapped with a better one, or a dead link.
+    Gone,
 }
 
 struct Active {
     session: Session,
     connection: Connection,
+    key: Fingerprint,
+    began: Mono,
+    /// Packets received, and when that last changed.
+    heard: (u64, Mono),
     writer: Writer,
     frames: mpsc::Receiver<Result<Frame, ControlError>>,
 }
@@ -110,6 +143,7 @@ pub struct ServoDead;
 
 impl Daemon {
     /// A daemon that serves `endpoint` and drives `servo`, whose timing is `timing` if it has a thread of its own.
+    /// The endpoint trusts whom the `desk` trusts.
     pub fn new(
         endpoint: Endpoint,
         clock: HostClock,
@@ -117,6 +151,7 @@ impl Daemon {
         config: SessionConfig,
         servo: Handle,
         timing: Option<Arc<Timing>>,
+        desk: Desk,
     ) -> Self {
         Self {
             endpoint,
@@ -125,8 +160,18 @@ impl Daemon {
             config,
             servo,
             timing,
+            desk,
+            external: None,
+            refused: Tally::default(),
             silent_drains: 0,
         }
+    }
+
+    /// The same with a clock that is kept right from outside.
+    #[must_use]
+    pub fn with_external(mut self, external: Option<External>) -> Self {
+        self.external = external;
+        self
     }
 
     /// Serves operators until `quit` turns true; then the arm is stopped (latched) and the endpoint closed.
@@ -139,9 +184,10 @@ impl Daemon {
         mut words: mpsc::UnboundedReceiver<Word>,
         notices: mpsc::UnboundedSender<Notice>,
     ) -> Result<(), ServoDead> {
-        let (greeted_tx, mut greeted) = mpsc::channel::<Greeted>(door::PLACES);
+        let (arrivals_tx, mut arrivals) = mpsc::channel::<Arrival>(door::PLACES);
         let mut drain = interval(DRAIN);
         drain.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let trust = self.desk.trust().clone();
         let mut active: Option<Active> = None;
         let mut skill: Option<Arc<Skill>> = None;
         let mut epoch = 0;
@@ -160,6 +206,13 @@ impl Daemon {
                 Some(word) = words.recv() => match word {
                     Word::Stop => self.servo.brake.stop_here(),
                     Word::Reset => self.order(Order::Reset { operator: active.is_some(), stop: None }),
+                    Word::Pair(span) => {
+                        let _ = notices.send(Notice::Pairing(self.desk.open(span)));
+                    }
+                    Word::Yes | Word::No => {
+                        let told = self.desk.word(word == Word::Yes).map(Notice::Pairing);
+                        told.map(|notice| notices.send(notice));
+                    }
                     // What an operator says; a robot's terminal does not know them.
                     Word::Keep | Word::Refine | Word::Save(_) => {}
                 },
@@ -171,7 +224,7 @@ impl Daemon {
                         return Err(ServoDead);
                     }
                 }
-                why = receive(active.as_mut(), &self.clock) => if let Some(why) = why {
+                why = receive(active.as_mut(), &self.clock, self.external.as_ref(), &trust) => if let Some(why) = why {
                     self.end(&mut active, &mut skill, (why.0, &why.1), &notices);
                 },
                 () = sleep_until(due.unwrap_or_else(tokio::time::Instant::now)), if due.is_some() => {
@@ -184,8 +237,8 @@ impl Daemon {
                         let from = incoming.remote_address().ip();
                         match door.knock(from, incoming.remote_address_validated()) {
                             Verdict::Enter(place) => {
-                                let greeting = greet(incoming, place, greeted_tx.clone(), notices.clone());
-                                tokio::spawn(tokio::time::timeout(door::STAY, greeting));
+                                let arriving = arrive(incoming, place, trust.clone(), arrivals_tx.clone());
+                                tokio::spawn(tokio::time::timeout(door::STAY, arriving));
                             }
                             // It may not be asked twice: then it knows a token already.
                             Verdict::Prove => drop(incoming.retry().map_err(|e| e.into_incoming().refuse())),
@@ -194,10 +247,22 @@ impl Daemon {
                     }
                     None => break,
                 },
-                Some(next) = greeted.recv() => {
-                    if let Some(why) = self.admit(next, &mut active, &skill, &mut epoch, &notices) {
-                        let _ = notices.send(Notice::Refused { why });
-                    }
+                progress = self.desk.next() => {
+                    let _ = notices.send(Notice::Pairing(progress));
+                }
+                Some(arrival) = arrivals.recv() => {
+                    let refused = match arrival {
+                        Arrival::Greeted(next) => self.admit(*next, &mut active, &mut skill, &mut epoch, &notices),
+                        Arrival::Pairing(connection) => {
+                            let peer = connection.remote_address();
+                            let taken = self.desk.receive(connection);
+                            (!taken).then(|| (peer, Reason::NoWindow, "no pairing window is open for it".to_owned()))
+                        }
+                        Arrival::Refused(peer, reason, why) => Some((peer, reason, why)),
+                        Arrival::Gone => None,
+                    };
+                    let told = refused.and_then(|(peer, reason, why)| self.refused.count(peer, reason, why));
+                    told.map(|refused| notices.send(Notice::Refused(refused)));
                 }
             }
         }
@@ -230,19 +295,32 @@ impl Daemon {
         &mut self,
         greeted: Greeted,
         active: &mut Option<Active>,
-        skill: &Option<Arc<Skill>>,
+        skill: &mut Option<Arc<Skill>>,
         epoch: &mut u32,
         notices: &mpsc::UnboundedSender<Notice>,
-    ) -> Option<String> {
+    ) -> Option<(std::net::SocketAddr, Reason, String)> {
         let Greeted {
             connection,
+            key,
             control,
             hello,
         } = greeted;
+        let now = self.clock.now();
+        let agreed = self.config.versions.choose(&hello);
+        let half_open = agreed.is_some()
+            && active.as_mut().is_some_and(|held| {
+                held.listen(now);
+                held.key == key && now.secs_since(held.heard.1) >= HALF_OPEN_S
+            });
+        if half_open {
+            let why = (CLOSED, "its operator has come back");
+            self.end(active, skill, why, notices);
+        }
         let versions = self.config.versions;
-        let agreed = match versions.choose(&hello) {
+        let agreed = match agreed {
             None => Err((
                 RejectCode::Version,
+                Reason::Version,
                 format!(
                     "this robot speaks {versions}, you offer {} to {}",
                     hello.min, hello.max
@@ -250,6 +328,7 @@ impl Daemon {
             )),
             Some(_) if active.is_some() => Err((
                 RejectCode::Busy,
+                Reason::Busy,
                 "another operator has authority".to_owned(),
             )),
             Some(version) => Ok(version),
@@ -257,10 +336,15 @@ impl Daemon {
         let peer = connection.remote_address();
         let version = match agreed {
             Ok(version) => version,
-            Err((code, text)) => {
-                let why = format!("{peer}: {text}");
+            Err((code, reason, text)) => {
+                // Attempts of one operator overlap: those that were under way when it was let in are no news.
+                let own = active.as_ref().is_some_and(|held| {
+                    let overlaps = now.secs_since(held.began) < OVERLAP_S;
+                    overlaps && held.key == key && held.connection.remote_address() == peer
+                });
+                let refused = (!own).then(|| (peer, reason, text.clone()));
                 tokio::spawn(turn_away(connection, control, code, text));
-                return Some(why);
+                return refused;
             }
         };
         *epoch += 1;
@@ -272,17 +356,14 @@ impl Daemon {
         let (writer, frames) = control.into_frames();
         // The first of an empty queue.
         let _ = writer.raw(ack.encode());
-        let session = Session::new(
-            self.config,
-            self.info.clone(),
-            *epoch,
-            skill.clone(),
-            self.clock.now(),
-        )
-        .speaking(version);
+        let session = Session::new(self.config, self.info.clone(), *epoch, skill.clone(), now)
+            .speaking(version);
         *active = Some(Active {
             session,
             connection,
+            key,
+            began: now,
+            heard: (0, now),
             writer,
             frames,
         });
@@ -309,6 +390,9 @@ impl Daemon {
     ) -> bool {
         let mut at_rest = false;
         self.silent_drains += 1;
+        if let Some(active) = active.as_deref_mut() {
+            active.listen(self.clock.now());
+        }
         let timing = self
             .timing
             .as_deref()
@@ -387,7 +471,7 @@ impl Daemon {
             let _ = notices.send(Notice::Path(knots.collect()));
         }
         let now = self.clock.now();
-        let clock = ended.clock();
+        let (clock, origin) = (ended.clock(), ended.clock().origin(now));
         let clock = clock
             .to_session(now)
             .zip(clock.uncertainty_s(now))
@@ -396,18 +480,25 @@ impl Daemon {
         let _ = notices.send(Notice::Disconnected {
             why: why.to_owned(),
             clock,
+            origin,
             counters,
         });
     }
 }
 
 /// The next thing the operator sends; a reason if it is the last. Never resolves without an operator.
-async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<(u32, String)> {
+async fn receive(
+    active: Option<&mut Active>,
+    clock: &HostClock,
+    external: Option<&External>,
+    trust: &Trust,
+) -> Option<(u32, String)> {
     let Some(active) = active else {
         return std::future::pending().await;
     };
     tokio::select! {
         biased;
+        standing = trust.withdrawn(active.key) => Some((NOT_TRUSTED, distrust(standing).1.to_owned())),
         frame = active.frames.recv() => match frame {
             Some(Ok(frame)) => {
                 active.session.handle_control(clock.now(), &frame).err().map(|e| (MALFORMED, format!("control message: {e}")))
@@ -417,6 +508,7 @@ async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<(u32,
         },
         datagram = active.connection.read_datagram() => match datagram {
             Ok(bytes) => {
+                active.session.set_external(external.map(|e| e.message(Mono(0))));
                 active.session.handle_datagram(clock.now(), &bytes);
                 None
             }
@@ -425,42 +517,76 @@ async fn receive(active: Option<&mut Active>, clock: &HostClock) -> Option<(u32,
     }
 }
 
+/// What a key that is not trusted is turned away with.
+fn distrust(standing: Standing) -> (Reason, &'static str) {
+    match standing {
+        Standing::Revoked => (Reason::RevokedKey, "the operator's key was revoked"),
+        Standing::Trusted | Standing::Unknown => {
+            (Reason::UnknownKey, "the operator's key is not pinned here")
+        }
+    }
+}
+
+impl Active {
+    fn listen(&mut self, now: Mono) {
+        let received = self.connection.stats().udp_rx.datagrams;
+        if received != self.heard.0 {
+            self.heard = (received, now);
+        }
+    }
+}
+
 /// Handshake and greeting, beside the running session.
-async fn greet(
-    incoming: Incoming,
-    _place: Place,
-    greeted: mpsc::Sender<Greeted>,
-    notices: mpsc::UnboundedSender<Notice>,
-) {
+async fn arrive(incoming: Incoming, _place: Place, trust: Trust, arrivals: mpsc::Sender<Arrival>) {
     let peer = incoming.remote_address();
-    let refused = |why: String| {
-        let _ = notices.send(Notice::Refused {
-            why: format!("{peer}: {why}"),
-        });
-    };
+    let arrival = greet(incoming, &trust).await;
+    let arrival = arrival.unwrap_or_else(|(reason, why)| Arrival::Refused(peer, reason, why));
+    // The daemon has stopped if nobody receives.
+    let _ = arrivals.send(arrival).await;
+}
+
+async fn greet(incoming: Incoming, trust: &Trust) -> Result<Arrival, (Reason, String)> {
     let connection = match incoming.await {
         Ok(connection) => connection,
-        Err(e) => return refused(quic::explain(&e)),
+        Err(e) => {
+            let reason = match (quic::refusal(&e), &e) {
+                (Some(quic::Refusal::KeyUnknown), _) => Reason::UnknownKey,
+                (Some(quic::Refusal::KeyRevoked), _) => Reason::RevokedKey,
+                (Some(quic::Refusal::Version), _) => Reason::Version,
+                (Some(_), _) | (None, ConnectionError::TransportError(_)) => Reason::Handshake,
+                (None, _) => return Ok(Arrival::Gone),
+            };
+            return Err((reason, quic::explain(&e)));
+        }
+    };
+    if quic::alpn(&connection).as_deref() == Some(pair::ALPN) {
+        return Ok(Arrival::Pairing(connection));
+    }
+    // While a pairing window is open TLS lets unknown keys pass.
+    let key = trust::key_of(&connection);
+    let standing = key.map_or(Standing::Unknown, |key| trust.standing(key));
+    let Some(key) = key.filter(|_| standing == Standing::Trusted) else {
+        let (reason, why) = distrust(standing);
+        connection.close(VarInt::from_u32(NOT_TRUSTED), why.as_bytes());
+        return Err((reason, why.to_owned()));
     };
     let mut control = match Control::accept(&connection).await {
         Ok(control) => control,
-        Err(e) => return refused(e.to_string()),
+        Err(ControlError::Connection(_)) => return Ok(Arrival::Gone),
+        Err(e) => return Err((Reason::Greeting, e.to_string())),
     };
     match control.hello().await {
-        Ok(hello) => {
-            // The daemon has stopped if nobody receives.
-            let _ = greeted
-                .send(Greeted {
-                    connection,
-                    control,
-                    hello,
-                })
-                .await;
-        }
+        Ok(hello) => Ok(Arrival::Greeted(Box::new(Greeted {
+            connection,
+            key,
+            control,
+            hello,
+        }))),
+        Err(ControlError::Connection(_) | ControlError::Stream(_)) => Ok(Arrival::Gone),
         Err(e) => {
             let text = e.to_string();
             turn_away(connection, control, RejectCode::Malformed, text.clone()).await;
-            refused(text);
+            Err((Reason::Greeting, text))
         }
     }
 }

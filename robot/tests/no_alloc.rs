@@ -7,17 +7,19 @@
 use std::collections::BTreeSet;
 
 use allocation_counter::measure;
-use nalgebra::{UnitQuaternion, Vector1, Vector3, Vector4};
+use nalgebra::{Matrix3, UnitQuaternion, Vector1, Vector3, Vector4};
 use telemime_endpoint::Mono;
 use telemime_protocol::checkpoint::PoseCurve;
-use telemime_protocol::predict::{Forecast, HandState, Params, TurnForecast, TurnState};
+use telemime_protocol::predict::{
+    Bend, Forecast, HandState, Held, Params, TurnForecast, TurnState,
+};
 use telemime_protocol::skill::example;
 use telemime_protocol::spline::{BSpline, End};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo::{
-    Core, Engagement, Handle, Lease, Order, Report, Source, Ticket, Trajectory, rings,
+    Bent, Core, Engagement, Handle, Lease, Order, Report, Source, Ticket, Trajectory, rings,
 };
 
 const MS: i64 = 1_000_000;
@@ -72,11 +74,30 @@ impl Bench {
         }
     }
 
-    fn extend(&mut self, number: u32) {
+    /// A hand at `plan_s` of the plan that holds on, or has just let go of a centimetre.
+    fn bent(&self, plan_s: f64, holds: bool) -> Bent {
+        let held = Held {
+            push: self.forecast(false),
+            weight: Matrix3::identity() * 0.01,
+        };
+        Bent {
+            bend: Bend {
+                plan_s,
+                rate: 1.0,
+                left: Vector3::x() * 0.01,
+                held: holds.then_some(held),
+            },
+            at: self.now,
+            sampled_at: self.now,
+        }
+    }
+
+    fn extend(&mut self, number: u32, bent: Option<Bent>) {
         let lease = self.lease();
         self.order(Order::Extend {
             ticket: ticket(number),
             lease,
+            bent,
         });
     }
 
@@ -194,11 +215,13 @@ fn a_tick_never_touches_the_heap() {
     // A plan to its end, one that takes the place of another, and one that is refused.
     bench.engage(2, trajectory(0.5));
     let mut played = bench.tick(400);
-    bench.extend(2);
+    bench.extend(2, None);
     bench.engage(3, trajectory(0.5));
-    for _ in 0..10 {
+    for i in 1..=16 {
         played = bench.tick(100);
-        bench.extend(2);
+        // A hand takes hold, and lets go after 0.4 s.
+        let bent = (i <= 4).then(|| bench.bent(0.1 * f64::from(i), i < 4));
+        bench.extend(2, bent);
     }
     assert_eq!(
         (played.state, played.cause),

@@ -4,14 +4,16 @@
     reason = "clippy.toml allows it in tests, but does not know these helpers for tests"
 )]
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
-use telemime_protocol::predict::{Forecast, HandState, Params};
+use telemime_protocol::checkpoint::PoseCurve;
+use telemime_protocol::predict::{Bend, Forecast, HandState, Held, Params};
+use telemime_protocol::spline::{BSpline, End};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo::{
-    Core, Engagement, Handle, Lease, Order, Report, Source, Ticket, rings,
+    Bent, Core, Engagement, Handle, Lease, Order, Report, Source, Ticket, Trajectory, rings,
 };
 
 const MS: i64 = 1_000_000;
@@ -98,6 +100,124 @@ impl Bench {
     }
 }
 
+/// From rest half a metre along x and to rest again, within 2 s.
+fn half_a_metre() -> Box<Trajectory> {
+    let t: Vec<f64> = (0..=20).map(|i| f64::from(i) * 0.1).collect();
+    let x: Vec<_> = t
+        .iter()
+        .map(|t| {
+            let u = t / 2.0;
+            HAND_M + Vector3::x() * (0.5 * u * u * (3.0 - 2.0 * u))
+        })
+        .collect();
+    Box::new(Trajectory {
+        curve: PoseCurve {
+            position: BSpline::interpolate(&t, &x, End::Natural).unwrap(),
+            orientation: None,
+            grip: None,
+        },
+        duration_s: 2.0,
+    })
+}
+
+#[test]
+fn a_hand_bends_a_plan_by_its_weight_and_the_plan_waits_for_it() {
+    let mut bench = Bench::new();
+    let trajectory = half_a_metre();
+    let curve = trajectory.curve.clone();
+    let lease = bench.lease();
+    bench.order(Order::Engage(Engagement {
+        ticket: ticket(1),
+        source: Source::Play(trajectory),
+        scale: 0.2,
+        rotation: UnitQuaternion::identity(),
+        lease,
+    }));
+    let go = |bench: &mut Bench, number: u32, bend: Option<Bend>| {
+        let (lease, at) = (bench.lease(), Mono(bench.now_ms * MS));
+        let bent = bend.map(|bend| Bent {
+            bend,
+            at,
+            sampled_at: at,
+        });
+        let ticket = ticket(number);
+        bench.order(Order::Extend {
+            ticket,
+            lease,
+            bent,
+        });
+    };
+    let beside = |r: &Report| {
+        let plan = curve.position_at(r.plan_s.unwrap());
+        r.mapping.unplace(r.tip_m) - plan
+    };
+    let aside = Vector3::new(0.0, 0.1, 0.0);
+    let still = HandState::first(Stamp::ZERO, aside);
+    let held = Bend {
+        plan_s: 1.0,
+        rate: 0.0,
+        left: Vector3::zeros(),
+        held: Some(Held {
+            push: Forecast::constant_velocity(&still, &Params::DEFAULT),
+            weight: Matrix3::from_diagonal(&Vector3::new(1.0, 0.6, 1.0)),
+        }),
+    };
+    for ms in 2..=1000 {
+        bench.tick_at(ms);
+        if ms % 100 == 0 {
+            go(&mut bench, 1, None);
+        }
+    }
+    // Nobody else's hand, then ours; what is not said again goes on.
+    let other = Bend {
+        plan_s: 0.0,
+        ..held
+    };
+    go(&mut bench, 2, Some(other));
+    assert!((bench.tick_at(1001).plan_s.unwrap() - 0.999).abs() < 1e-9);
+    go(&mut bench, 1, Some(held));
+    let mut last = None;
+    for ms in 1002..=2600 {
+        let report = bench.tick_at(ms);
+        assert_eq!(report.plan_s, Some(1.0));
+        assert_eq!(
+            report.state,
+            RobotState::Engaged,
+            "it is not over while held"
+        );
+        if ms % 100 == 0 {
+            go(&mut bench, 1, None);
+        }
+        last = Some(report);
+    }
+    let off = beside(&last.unwrap());
+    assert!((off - aside * 0.6).norm() < 1e-3, "{off}");
+    // Let go: it decays, and the plan goes on from where it waited.
+    let let_go = Bend {
+        rate: 1.0,
+        left: aside * 0.6,
+        held: None,
+        ..held
+    };
+    go(&mut bench, 1, Some(let_go));
+    let mut ended_ms = 0;
+    for ms in 2601..=5000 {
+        let report = bench.tick_at(ms);
+        if ms == 2900 {
+            let third = beside(&report).norm() / 0.06;
+            assert!((third - (-1.0f64).exp()).abs() < 0.05, "{third}");
+        }
+        if report.cause == Cause::PlanFinished && ended_ms == 0 {
+            ended_ms = ms;
+        }
+        if ms % 100 == 0 {
+            go(&mut bench, 1, None);
+        }
+    }
+    // One second of the plan, and 0.3 s to settle.
+    assert!((3900..=3903).contains(&ended_ms), "{ended_ms}");
+}
+
 #[test]
 fn a_lease_that_ended_while_the_servo_stalled_is_not_revived_by_what_waits() {
     let mut bench = Bench::new();
@@ -178,6 +298,7 @@ fn what_belongs_to_another_engagement_moves_nothing() {
         bench.order(Order::Extend {
             ticket: ticket(1),
             lease,
+            bent: None,
         });
         let report = bench.tick_at(ms);
         assert!(

@@ -328,6 +328,7 @@ fn a_plan_is_played_with_its_orientation_and_grip() {
             bench.order(Order::Extend {
                 ticket: TICKET,
                 lease,
+                bent: None,
             });
         }
         last = bench.tick();

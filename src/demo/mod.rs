@@ -1,6 +1,7 @@
 //! `telemime demo`: a robot and an operator as two processes, a bad link between them, and what is left
 //! of the delay.
 
+mod correct;
 mod figures;
 mod judge;
 mod play;
@@ -30,6 +31,9 @@ pub(crate) struct Args {
     /// Play the learned skill instead of mirroring a live hand.
     #[arg(long)]
     play: bool,
+    /// Play, and let a generated hand correct the motion: it pushes aside, resists until it has taken over, lets go.
+    #[arg(long, requires = "play", conflicts_with = "wrist")]
+    correct: bool,
     /// Learn from this folder of recordings (CSV: t,x,y,z) instead.
     #[arg(long, value_name = "DIR")]
     demos: Option<PathBuf>,
@@ -79,20 +83,27 @@ struct Material {
     matching: Option<String>,
     replay: PathBuf,
     recording: Demonstration,
+    /// What the hand does beside the motion that is played.
+    correction: Option<PathBuf>,
     what: String,
 }
 
 /// Runs `telemime demo`.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let scratch = tempfile::tempdir().context("no temporary folder")?;
-    let material = material(args, scratch.path())?;
     std::fs::create_dir_all(&args.out)
         .with_context(|| format!("cannot make {}", args.out.display()))?;
+    let mut material = material(args, scratch.path())?;
+    if args.correct {
+        material.correction = Some(correct::hand(args, &material)?);
+    }
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()?;
     let run = runtime.block_on(processes::run(args, &material, scratch.path()))?;
-    if args.play {
+    if args.correct {
+        correct::report(args, &material, &run)
+    } else if args.play {
         play::report(args, &material, &run)
     } else {
         let verdict = judge::judge(args, &material, &run)?;
@@ -131,27 +142,32 @@ fn material(args: &Args, scratch: &Path) -> anyhow::Result<Material> {
         matching: args.matching.clone(),
         replay,
         recording,
+        correction: None,
         what,
     })
 }
 
-/// A synthetic person waving: performances 0 to 4 to learn from, 5 to drive.
+/// A synthetic person waving, or carrying something if that is to be corrected: performances 0 to 4 to learn from, 5 to drive.
 fn generated(args: &Args, scratch: &Path) -> anyhow::Result<Material> {
-    let demos = scratch.join("swing");
+    let demos = scratch.join(if args.correct { "carry" } else { "swing" });
     std::fs::create_dir(&demos)?;
     let replay = scratch.join("unseen.csv");
     for index in 0..=PERFORMANCES {
-        let samples: Vec<_> = swing_with_wrist(args.seed, index)
-            .into_iter()
-            .map(|pose| {
-                let [w, x, y, z] = pose.q;
-                let q = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
-                Sample {
-                    orientation: args.wrist.then_some(q),
-                    ..Sample::at(pose.t_s, Vector3::from(pose.x))
-                }
-            })
-            .collect();
+        let samples: Vec<_> = if args.correct {
+            correct::demonstration(args.seed, index)
+        } else {
+            swing_with_wrist(args.seed, index)
+                .into_iter()
+                .map(|pose| {
+                    let [w, x, y, z] = pose.q;
+                    let q = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+                    Sample {
+                        orientation: args.wrist.then_some(q),
+                        ..Sample::at(pose.t_s, Vector3::from(pose.x))
+                    }
+                })
+                .collect()
+        };
         let path = if index < PERFORMANCES {
             demos.join(format!("{index}.csv"))
         } else {
@@ -163,12 +179,18 @@ fn generated(args: &Args, scratch: &Path) -> anyhow::Result<Material> {
         )?;
     }
     let recording = Demonstration::read_csv(&replay)?;
-    let what = format!("an arm swing, {PERFORMANCES} generated performances, driving one more");
+    let deed = if args.correct {
+        "carrying something"
+    } else {
+        "an arm swing"
+    };
+    let what = format!("{deed}, {PERFORMANCES} generated performances, driving one more");
     Ok(Material {
         demos,
         matching: None,
         replay,
         recording,
+        correction: None,
         what,
     })
 }

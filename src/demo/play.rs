@@ -7,6 +7,7 @@ use telemime_operator::cli::{Event as Operator, PlayReport, Scores};
 use telemime_operator::demonstration::Demonstrations;
 use telemime_operator::learn::align::align;
 use telemime_protocol::spline::{BSpline, End};
+use telemime_robot::servo::Mapping;
 
 use super::figures::{learned, load_skill, save, tube_panel};
 use super::judge::{engagement, read_ticks};
@@ -29,7 +30,18 @@ struct Result {
     tick_p99_us: f64,
 }
 
-pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Result<()> {
+/// What was sent, and what the tip made of it.
+pub(super) struct Played {
+    pub(super) plan: PlayReport,
+    /// The plan as both ends rebuild it.
+    pub(super) spline: BSpline<3>,
+    pub(super) mapping: Mapping,
+    pub(super) engaged_ns: i64,
+    /// The tip over the time since the engage, mapped back to hand metres.
+    pub(super) tip: Track,
+}
+
+pub(super) fn played(run: &Run) -> anyhow::Result<Played> {
     let plan = run.operator.iter().find_map(|e| {
         if let Operator::Plan(plan) = e {
             Some(plan)
@@ -47,13 +59,31 @@ pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Res
         )
     });
     let tip = Track::new(tip.collect())?;
-
-    let (t, x): (Vec<f64>, Vec<_>) = plan
-        .points
-        .iter()
-        .map(|(t, x)| (*t, Vector3::from(*x)))
-        .unzip();
+    let (t, x) = checkpoints(&plan);
     let spline = BSpline::<3>::interpolate(&t, &x, End::Natural)?;
+    Ok(Played {
+        plan,
+        spline,
+        mapping,
+        engaged_ns,
+        tip,
+    })
+}
+
+fn checkpoints(plan: &PlayReport) -> (Vec<f64>, Vec<Vector3<f64>>) {
+    let points = plan.points.iter();
+    points.map(|(t, x)| (*t, Vector3::from(*x))).unzip()
+}
+
+pub(super) fn report(args: &Args, material: &Material, run: &Run) -> anyhow::Result<()> {
+    let Played {
+        plan,
+        spline,
+        mapping,
+        tip,
+        ..
+    } = played(run)?;
+    let (t, x) = checkpoints(&plan);
     let (start_s, end_s) = spline.span_s();
     let grid: Vec<f64> = (0..=400)
         .map(|i| start_s + (end_s - start_s) * f64::from(i) / 400.0)

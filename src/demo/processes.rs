@@ -175,6 +175,8 @@ pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> any
         .unwrap_or_default();
     if args.play {
         operator_args.extend(["--play".to_owned(), name.clone()]);
+        let correction = material.correction.as_deref();
+        operator_args.extend(flag("--correct", correction.map(text)));
     } else {
         operator_args.extend(["--replay".to_owned(), text(&material.replay)]);
     }
@@ -255,6 +257,9 @@ async fn watch_operator(
             Operator::Engaged { .. } => bar.set_message("driving"),
             Operator::State { state, cause, .. } if state == "Coasting" || state == "Holding" => {
                 bar.suspend(|| eprintln!("robot: {state} ({cause})"));
+            }
+            Operator::Correction { what, .. } => {
+                bar.set_message(format!("playing; the hand: {what}"))
             }
             Operator::Progress { done } => bar.set_position((done * 1e3) as u64),
             _ => {}

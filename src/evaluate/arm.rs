@@ -11,7 +11,9 @@ use telemime_robot::servo::{Mapping, RAMP_S, Report};
 use telemime_sim::link::{Fate, Link, LinkConfig};
 
 use crate::ground::{Pair, PairError, run_virtual};
-use crate::measure::{Hand, Track, follow, is_edge, rmse_m, sample_and_hold};
+use crate::measure::{
+    Hand, Track, follow, is_edge, rms, rmse_m, sample_and_hold, smooth_jerk_m_s3,
+};
 
 /// The hand rests this long before the recording begins, s: one engages at rest.
 const REST_S: f64 = 1.0;
@@ -58,6 +60,8 @@ pub(super) struct Driven {
     pub(super) scale: f64,
     /// Ticks on which a limit acted.
     pub(super) clamps: u32,
+    /// Σ of the command's squared jerk over the moments, and of the scaled hand's through the filter, (m/s³)².
+    pub(super) jerk_2: [f64; 2],
     pub(super) messages: u32,
     pub(super) duration_s: f64,
 }
@@ -122,7 +126,11 @@ pub(super) fn drive(
     let counters = summary.counters;
     let mut driven = judge(&truth, &tip, from_s, &mapping, drive, seed);
     let judged = |r: &&&Report| (from_s..=d.duration_s()).contains(&time_s(r));
-    driven.clamps = engaged.iter().filter(judged).last().map_or(0, |r| r.clamps);
+    driven.clamps = engaged.iter().rfind(judged).map_or(0, |r| r.clamps);
+    let jerks = engaged.iter().filter(judged).map(|r| r.jerk_m_s3);
+    let hand_jerk = mapping.scale * smooth_jerk_m_s3(&truth, from_s, d.duration_s());
+    let ticks = driven.moments as f64;
+    driven.jerk_2 = [rms(jerks), hand_jerk].map(|jerk| jerk * jerk * ticks);
     driven.messages = counters.messages;
     driven.duration_s = d.duration_s() - time_s(begin);
     Ok(driven)
@@ -181,6 +189,7 @@ fn judge(
         lag_s: std::array::from_fn(|n| lag_s(&ways[n])),
         scale: mapping.scale,
         clamps: 0,
+        jerk_2: [0.0; 2],
         messages: 0,
         duration_s: 0.0,
     }

@@ -59,6 +59,10 @@ impl Outcome {
 
 /// What the robot makes of a message.
 #[derive(Clone, Copy)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "one lives at a time, on the stack"
+)]
 enum Told {
     /// The hand was there, and may move on at this velocity (m/s).
     Straight(Stamp, Vector3<f64>, Vector3<f64>),
@@ -102,6 +106,7 @@ pub(super) fn run(
     scheme: Scheme,
     d: &Demonstration,
     skill: &Arc<Skill>,
+    session: &SessionConfig,
     link: &LinkConfig,
     seed: u64,
 ) -> Outcome {
@@ -114,8 +119,13 @@ pub(super) fn run(
         Scheme::Everything => by_rule(d, &mut wire, &mut outcome, 0.0, 0.0),
         Scheme::DeadbandHold(bound_m) => by_rule(d, &mut wire, &mut outcome, 0.0, bound_m),
         Scheme::DeadbandStraight(bound_m) => by_rule(d, &mut wire, &mut outcome, 1.0, bound_m),
-        Scheme::Session(bound, silence_s) => {
-            by_session(d, skill, &mut wire, &mut outcome, bound, silence_s)
+        Scheme::Session(future_bound, silence_s) => {
+            let config = SessionConfig {
+                future_bound,
+                max_silence_s: silence_s.unwrap_or(NEVER_S),
+                ..*session
+            };
+            by_session(d, skill, &mut wire, &mut outcome, config)
         }
     };
     // Before the first message can have come there is nothing to be judged.
@@ -171,14 +181,8 @@ fn by_session(
     skill: &Arc<Skill>,
     wire: &mut Link,
     outcome: &mut Outcome,
-    future_bound: FutureBound,
-    silence_s: Option<f64>,
+    config: SessionConfig,
 ) -> Vec<Arrival> {
-    let config = SessionConfig {
-        future_bound,
-        max_silence_s: silence_s.unwrap_or(NEVER_S),
-        ..SessionConfig::default()
-    };
     let delay_s = wire.config().delay_s;
     let mut live = Live::new(skill, config, delay_s);
     let mut arrivals = Vec::new();
@@ -273,11 +277,25 @@ mod tests {
     #[test]
     fn holding_over_a_link_errs_by_the_way_of_its_delay() {
         let (d, skill) = (straight_on(), skill());
-        let held = run(Scheme::Everything, &d, &skill, &slow(0.0), 1);
+        let held = run(
+            Scheme::Everything,
+            &d,
+            &skill,
+            &SessionConfig::default(),
+            &slow(0.0),
+            1,
+        );
         assert_eq!(held.messages, 90);
         assert!((held.rmse_m().unwrap() - 0.2).abs() < 1e-6);
         // Half of the samples are late by one more interval, or by several.
-        let lossy = run(Scheme::Everything, &d, &skill, &slow(0.5), 1);
+        let lossy = run(
+            Scheme::Everything,
+            &d,
+            &skill,
+            &SessionConfig::default(),
+            &slow(0.5),
+            1,
+        );
         assert!(lossy.rmse_m().unwrap() > 0.22);
         assert_eq!(lossy.messages, 90, "what is lost was sent");
     }
@@ -285,7 +303,7 @@ mod tests {
     #[test]
     fn a_deadband_sends_what_it_must_and_dead_reckoning_less() {
         let (d, skill) = (straight_on(), skill());
-        let send = |scheme| run(scheme, &d, &skill, &slow(0.0), 1);
+        let send = |scheme| run(scheme, &d, &skill, &SessionConfig::default(), &slow(0.0), 1);
         // 6.7 cm from sample to sample: every third is more than 15 cm on.
         assert_eq!(send(Scheme::DeadbandHold(0.15)).messages, 30);
         let reckoned = send(Scheme::DeadbandStraight(0.01));
@@ -298,13 +316,27 @@ mod tests {
         let (d, skill) = (straight_on(), skill());
         let session = |silence_s| {
             let never = FutureBound::Absolute(1e3);
-            run(Scheme::Session(never, silence_s), &d, &skill, &slow(0.0), 1)
+            run(
+                Scheme::Session(never, silence_s),
+                &d,
+                &skill,
+                &SessionConfig::default(),
+                &slow(0.0),
+                1,
+            )
         };
         // The first sample, and then a word every 0.2 s of 2.97 s.
         assert_eq!(session(Some(0.2)).messages, 15);
         assert_eq!(session(None).messages, 1);
         let everything = FutureBound::Absolute(1e-9);
-        let all = run(Scheme::Session(everything, None), &d, &skill, &slow(0.0), 1);
+        let all = run(
+            Scheme::Session(everything, None),
+            &d,
+            &skill,
+            &SessionConfig::default(),
+            &slow(0.0),
+            1,
+        );
         assert!(all.bytes > all.messages * HEADERS);
         assert!(all.bytes < all.messages * (HEADERS + 90), "{} B", all.bytes);
     }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Vector1, Vector3};
 use telemime_operator::demonstration::{Demonstration, Sample};
 use telemime_operator::session::SessionConfig;
+use telemime_operator::session::adapt::Adaptation;
 use telemime_protocol::pose;
 use telemime_protocol::predict::{
     Ahead, Calibration, HandState, KNOT_SPACING_S, MAX_KNOTS, Posterior, TurnState,
@@ -80,7 +81,7 @@ pub(super) trait Expert {
 }
 
 /// Names, in the order of [`experts`].
-pub(super) const PLACE_NAMES: [&str; 8] = [
+pub(super) const PLACE_NAMES: [&str; 9] = [
     "hold",
     "constant velocity",
     "damped velocity ×0.5",
@@ -88,25 +89,33 @@ pub(super) const PLACE_NAMES: [&str; 8] = [
     "Kalman",
     "clock-indexed GMR",
     "mixture alone",
+    "guard, rest unseen",
     GUARDED,
 ];
 
 /// The same of orientations.
-pub(super) const TURN_NAMES: [&str; 7] = [
+pub(super) const TURN_NAMES: [&str; 8] = [
     "hold",
     "constant velocity",
     "damped velocity ×0.5",
     "generic",
     "clock-indexed GMR",
     "mixture alone",
+    "guard, rest unseen",
     GUARDED,
 ];
 
 /// What a session sends: the predictor as it is used.
 pub(super) const GUARDED: &str = "guarded";
 
-/// All of them, for one performance. `kalman` was tuned on what `skill` was learned from.
-pub(super) fn experts(side: Side, skill: &Arc<Skill>, kalman: &Kalman) -> Vec<Box<dyn Expert>> {
+/// All of them, for one performance. `kalman` was tuned on what `skill` was learned from; what a session sends is set
+/// to `session`.
+pub(super) fn experts(
+    side: Side,
+    skill: &Arc<Skill>,
+    kalman: &Kalman,
+    session: &SessionConfig,
+) -> Vec<Box<dyn Expert>> {
     let damped = |factor: f64| -> Box<dyn Expert> { Box::new(Straight::new(side, factor)) };
     let mut all = vec![damped(0.0), damped(1.0), damped(0.5)];
     all.push(Box::new(Generic {
@@ -124,7 +133,8 @@ pub(super) fn experts(side: Side, skill: &Arc<Skill>, kalman: &Kalman) -> Vec<Bo
         hand: None,
         posterior: None,
     }));
-    all.push(Box::new(Guarded::new(side, skill)));
+    all.push(Box::new(Unrested::new(side, skill)));
+    all.push(Box::new(Guarded::new(side, skill, session)));
     all
 }
 
@@ -323,6 +333,69 @@ impl Expert for Mixture {
     }
 }
 
+/// The session's guard on a hand of which nobody says that it has rested: what it costs not to begin motion that
+/// the person has not begun.
+struct Unrested {
+    side: Side,
+    skill: Arc<Skill>,
+    hand: Option<Hand>,
+    places: Adaptation<HandState>,
+    turns: Adaptation<TurnState>,
+    ahead: Option<Ahead>,
+}
+
+impl Unrested {
+    fn new(side: Side, skill: &Arc<Skill>) -> Self {
+        let turns = skill
+            .turn()
+            .map(|turn| turn.predictor.model().calibration());
+        let places = skill.predictor().calibration();
+        Self {
+            side,
+            skill: Arc::clone(skill),
+            hand: None,
+            places: Adaptation::of_places(1.0, Some(places), skill.stats().reach_m),
+            turns: Adaptation::of_turns(1.0, turns),
+            ahead: None,
+        }
+    }
+}
+
+impl Expert for Unrested {
+    fn take(&mut self, sample: &Sample) {
+        let before = self.hand;
+        let hand = Hand::take(&mut self.hand, sample);
+        let turn = self.skill.turn().map(|turn| &turn.predictor);
+        self.ahead = match (self.side, turn, hand.turn) {
+            (Side::Place, ..) => {
+                let model = self.skill.predictor();
+                if let Some(before) = before {
+                    self.places.observe(&before.place, &hand.place, Some(model));
+                }
+                let params = self.places.params(&hand.place);
+                Some(model.forecast(&hand.place, &params).ahead)
+            }
+            (Side::Turn, Some(model), Some(state)) => {
+                if let Some(before) = before.and_then(|hand| hand.turn) {
+                    self.turns.observe(&before, &state, Some(model));
+                }
+                Some(model.forecast(&state, &self.turns.params(&state)).ahead)
+            }
+            _ => None,
+        };
+    }
+
+    fn ahead(&self, h_s: f64) -> Guess {
+        match &self.ahead {
+            Some(ahead) => Guess {
+                way: ahead.at(h_s).displacement,
+                spread: Some(covariance(ahead, h_s)),
+            },
+            None => Vector3::zeros().into(),
+        }
+    }
+}
+
 /// What the robot predicts from a session that sends every sample, as the wire carries it.
 struct Guarded {
     side: Side,
@@ -335,11 +408,11 @@ struct Guarded {
 const DELAY_S: f64 = 0.1;
 
 impl Guarded {
-    fn new(side: Side, skill: &Arc<Skill>) -> Self {
+    fn new(side: Side, skill: &Arc<Skill>, session: &SessionConfig) -> Self {
         let config = SessionConfig {
             max_silence_s: 0.0,
             min_interval_s: 0.0,
-            ..SessionConfig::default()
+            ..*session
         };
         Self {
             side,

@@ -284,7 +284,7 @@ mod tests {
             let t = (t - 0.5).max(0.0);
             Vector3::new(0.2 * (1.0 - (4.0 * t).cos()), 0.0, 1.0)
         };
-        let samples: Vec<_> = (0..90)
+        let samples: Vec<_> = (0..100)
             .map(|i| f64::from(i) / 30.0)
             .map(|t| Sample::at(t, place(t)))
             .collect();
@@ -309,7 +309,7 @@ mod tests {
     fn a_prediction_too_large_by_a_fifth_is_seen_to_be() {
         let (d, h_s) = (swing(), 0.1);
         let shape = Shape::of(&d);
-        let course: Vec<_> = (0..80)
+        let course: Vec<_> = (0..90)
             .map(|sample| {
                 let now = &d.samples()[sample];
                 let truth = Side::Place.way(&d, sample, now.t_s + h_s);

@@ -6,8 +6,8 @@ use super::dual::Scheme;
 use super::experts::GUARDED;
 use super::report::{Report, Section, nearest};
 use crate::figure::{
-    BLACK, BLUE, Figure, FigureError, GREEN, GREY, Layer, ORANGE, Panel, SILVER, SKY, Shape,
-    VERMILLION,
+    BLACK, BLUE, Figure, FigureError, GREEN, GREY, Layer, ORANGE, PURPLE, Panel, SILVER, SKY,
+    Shape, VERMILLION,
 };
 use plotters::style::RGBColor;
 
@@ -45,10 +45,11 @@ pub(super) fn colour(name: &str) -> RGBColor {
         "hold" => BLACK,
         "constant velocity" => ORANGE,
         "damped velocity ×0.5" => VERMILLION,
-        "generic" => SKY,
+        "generic" => PURPLE,
         "Kalman" => SILVER,
         "clock-indexed GMR" => GREY,
         "mixture alone" => GREEN,
+        "guard, rest unseen" => SKY,
         _ => BLUE,
     }
 }

@@ -78,6 +78,9 @@ pub(crate) struct Args {
     /// The recordings' axes, as the arm is to see them.
     #[arg(long, value_enum, default_value_t = Axes::Kinect, requires = "arm")]
     axes: Axes,
+    /// Sessions replace what looks like a tracker's glitch (see `telemime operator`).
+    #[arg(long)]
+    glitch_gate: bool,
     /// Draw what was found (.svg or .png).
     #[arg(long, value_name = "FILE")]
     figure: Option<PathBuf>,
@@ -119,16 +122,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         bail!("--rate: the study's link has no bottleneck; telemime demo shows one");
     }
     let schemes = schemes(&sets, link.delay_s);
+    let session = SessionConfig {
+        glitch_gate: args.glitch_gate,
+        rotation: args.axes.rotation(),
+        ..SessionConfig::default()
+    };
     let arm = if args.arm {
         Some(Drive {
             rig: Rig::load(&RigOptions {
                 urdf: args.urdf.clone(),
                 ..RigOptions::default()
             })?,
-            config: SessionConfig {
-                rotation: args.axes.rotation(),
-                ..SessionConfig::default()
-            },
+            config: session,
             link: link.clone(),
         })
     } else {
@@ -143,6 +148,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             .demonstrations
             .map_or(args.protocol.usual(), usize::from),
         horizons_s: &horizons_s,
+        session: &session,
         schemes: &schemes,
         link: &link,
         arm: arm.as_ref(),

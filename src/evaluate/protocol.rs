@@ -7,6 +7,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use telemime_operator::demonstration::{Demonstration, Demonstrations, PersonPattern};
 use telemime_operator::learn::{LearnError, LearnOptions, learn_skill};
+use telemime_operator::session::SessionConfig;
 use telemime_protocol::skill::{MAX_SOURCES, Skill};
 use telemime_sim::link::LinkConfig;
 
@@ -107,6 +108,8 @@ pub(super) struct Plan<'a> {
     /// Most demonstrations a skill is learned from.
     pub(super) most: usize,
     pub(super) horizons_s: &'a [f64],
+    /// What sessions are set to, but for their bounds and silences.
+    pub(super) session: &'a SessionConfig,
     pub(super) schemes: &'a [Scheme],
     pub(super) link: &'a LinkConfig,
     /// The arm to drive, too.
@@ -316,7 +319,7 @@ impl Plan<'_> {
     ) -> Result<Performance, EvaluateError> {
         let mut novelty = Vec::new();
         let mut perform = |side: Side| {
-            let mut experts = experts(side, skill, kalman);
+            let mut experts = experts(side, skill, kalman, self.session);
             perform(side, d, &mut experts, self.horizons_s, |expert| {
                 if side == Side::Place {
                     novelty.extend(expert.novelty());
@@ -336,7 +339,7 @@ impl Plan<'_> {
         };
         let changed = faults::change_of_mind(d).filter(|_| off.is_none());
         let mind = changed.map(|(changed, turn_s)| {
-            let mut experts = experts(Side::Place, skill, kalman);
+            let mut experts = experts(Side::Place, skill, kalman, self.session);
             faults::around(&changed, turn_s, &mut experts, MIND_AT_S)
         });
         let tallies = |side, courses: &[Vec<Course>]| {
@@ -363,7 +366,7 @@ impl Plan<'_> {
             mind: mind.unwrap_or_default(),
             dual: schemes
                 .iter()
-                .map(|scheme| dual::run(*scheme, d, skill, self.link, seed))
+                .map(|scheme| dual::run(*scheme, d, skill, self.session, self.link, seed))
                 .collect(),
             driven,
         })
@@ -428,6 +431,7 @@ mod tests {
             persons: &PersonPattern::default(),
             most,
             horizons_s: &[0.1],
+            session: &SessionConfig::default(),
             schemes: &[],
             link: &LinkConfig::default(),
             arm: None,

@@ -159,6 +159,8 @@ pub(super) struct Arm {
     /// Share of the performances whose lag is within 10 ms.
     pub(super) lag_within_10_ms: f64,
     pub(super) messages_per_s: f64,
+    /// RMS jerk of the command over that of the scaled hand through a filter of 60 rad/s.
+    pub(super) jerk: Option<f64>,
     /// Ticks on which a limit acted, of all that were judged.
     pub(super) clamped: f64,
 }
@@ -391,6 +393,7 @@ fn arm(plan: &Plan<'_>, performances: &[Performance]) -> Option<Arm> {
         (m + f64::from(one.messages), s + one.duration_s)
     });
     let clamps: f64 = driven.iter().map(|(_, one)| f64::from(one.clamps)).sum();
+    let jerk_2 = |n: usize| -> f64 { driven.iter().map(|(_, one)| one.jerk_2[n]).sum() };
     (!driven.is_empty()).then(|| Arm {
         driven: driven.len(),
         scale: [
@@ -407,6 +410,7 @@ fn arm(plan: &Plan<'_>, performances: &[Performance]) -> Option<Arm> {
             .and_then(|((delayed, own), known)| finite((delayed - own) / (delayed - known))),
         lag_within_10_ms: within as f64 / driven.len() as f64,
         messages_per_s: messages / seconds,
+        jerk: finite((jerk_2(0) / jerk_2(1)).sqrt()),
         clamped: clamps / moments as f64,
     })
 }

@@ -264,12 +264,13 @@ fn arm(out: &mut String, report: &Report) {
     let _ = writeln!(
         out,
         "{} over delayed, same arm; {} over delayed, ideal tip; fraction hidden {}; lag within 10 ms in {:.0} %\n\
-         {:.1} messages/s; a limit acted on {:.1} % of the ticks",
+         {:.1} messages/s; jerk of the command over the hand's {}; a limit acted on {:.1} % of the ticks",
         number(arm.over_delayed_same_arm, 3),
         number(arm.over_delayed_ideal, 3),
         number(arm.fraction_hidden, 3),
         100.0 * arm.lag_within_10_ms,
         arm.messages_per_s,
+        number(arm.jerk, 2),
         100.0 * arm.clamped
     );
     if arm.of_groups.len() > 1 {

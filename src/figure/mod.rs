@@ -7,7 +7,7 @@ mod draw;
 mod theme;
 
 use std::path::{Path, PathBuf};
-pub(crate) use theme::{BLACK, BLUE, GREEN, GREY, ORANGE, SILVER, SKY, VERMILLION};
+pub(crate) use theme::{BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SILVER, SKY, VERMILLION};
 
 use plotters::style::RGBColor;
 

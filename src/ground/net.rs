@@ -17,6 +17,8 @@ use tokio::time::{Instant, sleep_until};
 
 #[derive(Default)]
 struct Inbox {
+    /// Of the socket it belongs to: another may have come to its address later.
+    id: u64,
     packets: VecDeque<(SocketAddr, Vec<u8>)>,
     waker: Option<Waker>,
 }
@@ -26,6 +28,15 @@ struct State {
     inboxes: BTreeMap<SocketAddr, Inbox>,
     links: BTreeMap<(SocketAddr, SocketAddr), Link>,
     down: bool,
+    sockets: u64,
+    tape: Option<Vec<Taped>>,
+}
+
+/// A packet that somebody on the way has kept.
+struct Taped {
+    from: SocketAddr,
+    to: SocketAddr,
+    packet: Vec<u8>,
 }
 
 /// Sockets and the links between them, on tokio's clock.
@@ -46,16 +57,32 @@ impl Network {
             inboxes: BTreeMap::new(),
             links: BTreeMap::new(),
             down: false,
+            sockets: 0,
+            tape: None,
         })))
     }
 
     /// A socket at `addr`.
     pub fn socket(&self, addr: SocketAddr) -> Arc<Socket> {
-        self.state().inboxes.insert(addr, Inbox::default());
+        let mut state = self.state();
+        state.sockets += 1;
+        let id = state.sockets;
+        let inbox = Inbox {
+            id,
+            ..Inbox::default()
+        };
+        state.inboxes.insert(addr, inbox);
+        drop(state);
         Arc::new(Socket {
             network: self.clone(),
             addr,
+            id,
         })
+    }
+
+    /// Takes the socket at `addr` away: what it sends, and what is sent to it, is lost.
+    pub fn remove(&self, addr: SocketAddr) {
+        self.state().inboxes.remove(&addr);
     }
 
     /// Sets the link from `from` to `to`.
@@ -70,14 +97,33 @@ impl Network {
         self.state().down = down;
     }
 
+    /// From now on keeps a copy of every packet that is delivered.
+    pub fn record(&self) {
+        self.state().tape = Some(Vec::new());
+    }
+
+    /// Delivers every packet that was kept once more, at once and in order, as somebody on the way could; how many.
+    pub fn replay(&self) -> usize {
+        let tape = self.state().tape.take().unwrap_or_default();
+        let count = tape.len();
+        for Taped { from, to, packet } in tape {
+            self.deliver(from, to, packet);
+        }
+        count
+    }
+
     fn state(&self) -> MutexGuard<'_, State> {
         self.0
             .lock()
             .expect("no code panics while it holds the network")
     }
 
-    fn send(&self, from: SocketAddr, to: SocketAddr, packet: &[u8]) {
+    fn send(&self, socket: &Socket, to: SocketAddr, packet: &[u8]) {
+        let from = socket.addr;
         let mut state = self.state();
+        if state.inboxes.get(&from).is_none_or(|i| i.id != socket.id) {
+            return;
+        }
         let now_ns = state.epoch.elapsed().as_nanos() as i64;
         let len = packet.len() + IP_UDP_HEADER as usize;
         let fate = match state.links.get_mut(&(from, to)) {
@@ -101,6 +147,10 @@ impl Network {
 
     fn deliver(&self, from: SocketAddr, to: SocketAddr, packet: Vec<u8>) {
         let mut state = self.state();
+        if let Some(tape) = &mut state.tape {
+            let packet = packet.clone();
+            tape.push(Taped { from, to, packet });
+        }
         let Some(inbox) = state.inboxes.get_mut(&to) else {
             return;
         };
@@ -115,6 +165,7 @@ impl Network {
 pub struct Socket {
     network: Network,
     addr: SocketAddr,
+    id: u64,
 }
 
 impl fmt::Debug for Socket {
@@ -143,7 +194,7 @@ impl AsyncUdpSocket for Socket {
             .unwrap_or(transmit.contents.len())
             .max(1);
         for packet in transmit.contents.chunks(segment) {
-            self.network.send(self.addr, transmit.destination, packet);
+            self.network.send(self, transmit.destination, packet);
         }
         Ok(())
     }
@@ -155,8 +206,10 @@ impl AsyncUdpSocket for Socket {
         meta: &mut [RecvMeta],
     ) -> Poll<io::Result<usize>> {
         let mut state = self.network.state();
-        let Some(inbox) = state.inboxes.get_mut(&self.addr) else {
-            return Poll::Ready(Err(io::ErrorKind::NotConnected.into()));
+        let inbox = state.inboxes.get_mut(&self.addr);
+        let Some(inbox) = inbox.filter(|inbox| inbox.id == self.id) else {
+            // Taken away: nothing arrives any more, and nobody is told.
+            return Poll::Pending;
         };
         let mut received = 0;
         while received < bufs.len().min(meta.len())

@@ -8,8 +8,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use telemime_endpoint::cli::Word;
+use telemime_endpoint::pairing::Own;
+use telemime_endpoint::peers::Name;
 use telemime_endpoint::quic::EndpointError;
-use telemime_endpoint::{HostClock, Identity, IdentityError, Meter, Mono, quic};
+use telemime_endpoint::{
+    External, Fingerprint, HostClock, Identity, IdentityError, Meter, Mono, Trust, quic,
+};
 use telemime_operator::daemon::{
     Daemon as OperatorDaemon, DaemonError, Learning, Notice as OperatorNotice, Summary,
 };
@@ -18,6 +22,7 @@ use telemime_operator::task::Task;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_robot::daemon::{Daemon as RobotDaemon, Notice as RobotNotice};
+use telemime_robot::desk::Desk;
 use telemime_robot::rig::Rig;
 use telemime_robot::servo::{self, Report};
 use telemime_robot::session::SessionConfig as RobotConfig;
@@ -69,7 +74,11 @@ pub struct Pair {
     pub network: Network,
     /// The robot.
     pub robot: Robot,
+    /// Whom the robot trusts.
+    pub trust: Trust,
     clock: HostClock,
+    config: RobotConfig,
+    external: Option<(External, External)>,
     robot_identity: Identity,
     operator_identity: Identity,
     operators: u8,
@@ -84,6 +93,7 @@ pub struct Robot {
     notices: Rc<RefCell<Vec<RobotNotice>>>,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
+    tasks: Rc<[tokio::task::AbortHandle; 2]>,
 }
 
 /// An operator of a [`Pair`], running.
@@ -92,11 +102,75 @@ pub struct Operator {
     pub done: tokio::task::JoinHandle<(Result<Summary, DaemonError>, Task)>,
     /// What it notices.
     pub notices: mpsc::UnboundedReceiver<OperatorNotice>,
+    /// Its address.
+    pub addr: SocketAddr,
+    endpoint: quinn::Endpoint,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
 }
 
 impl Robot {
+    fn start(
+        network: &Network,
+        clock: HostClock,
+        rig: &Rig,
+        identity: &Identity,
+        trust: &Trust,
+        config: RobotConfig,
+        external: Option<External>,
+    ) -> Result<Self, PairError> {
+        let (rings, handle) = servo::rings();
+        let mut core = rig.servo(rings);
+        let period = Duration::from_secs_f64(core.tick_s());
+        let servo = tokio::task::spawn_local(async move {
+            let mut tick = interval(period);
+            tick.set_missed_tick_behavior(MissedTickBehavior::Burst);
+            loop {
+                tick.tick().await;
+                core.tick(clock.now());
+            }
+        });
+        let socket = quic::Socket::Abstract {
+            socket: network.socket(host(1)),
+            seed: [1; 32],
+        };
+        let endpoint = quic::server(identity, trust, socket, &Meter::default())?;
+        let own = Own {
+            name: Name::made_of("virtual-robot"),
+            key: identity.fingerprint(),
+        };
+        let desk = Desk::new(own, trust.clone(), None);
+        let daemon = RobotDaemon::new(endpoint, clock, rig.info(), config, handle, None, desk)
+            .with_external(external);
+        let (quit, quit_rx) = watch::channel(false);
+        let (tx, mut rx) = mpsc::unbounded_channel();
+        let (words, words_rx) = mpsc::unbounded_channel();
+        let serving = tokio::task::spawn_local(daemon.run(quit_rx, words_rx, tx));
+        let robot = Self {
+            reports: Rc::default(),
+            notices: Rc::default(),
+            quit,
+            words,
+            tasks: Rc::new([servo.abort_handle(), serving.abort_handle()]),
+        };
+        let log = robot.clone();
+        tokio::task::spawn_local(async move {
+            while let Some(notice) = rx.recv().await {
+                match notice {
+                    RobotNotice::Report(report) => log.reports.borrow_mut().push(*report),
+                    other => log.notices.borrow_mut().push(other),
+                }
+            }
+        });
+        Ok(robot)
+    }
+
+    /// Ends everything without a word.
+    fn kill(&self, network: &Network) {
+        network.remove(host(1));
+        self.tasks.iter().for_each(tokio::task::AbortHandle::abort);
+    }
+
     /// Every tick so far.
     pub fn reports(&self) -> std::cell::Ref<'_, Vec<Report>> {
         self.reports.borrow()
@@ -120,6 +194,24 @@ impl Robot {
 }
 
 impl Operator {
+    /// Ends it without a word, as `kill -9` does.
+    pub fn kill(&self, network: &Network) {
+        network.remove(self.addr);
+        self.done.abort();
+    }
+
+    /// Moves it to another address of the network, as a laptop that changes from one network to another; the links
+    /// there are whatever [`Network::link`] says.
+    ///
+    /// # Errors
+    /// [`PairError::Runtime`] if QUIC does not take the socket.
+    pub fn rebind(&mut self, network: &Network, to: SocketAddr) -> Result<(), PairError> {
+        let socket = network.socket(to);
+        network.remove(self.addr);
+        self.addr = to;
+        Ok(self.endpoint.rebind_abstract(socket)?)
+    }
+
     /// A word at the operator's own terminal.
     pub fn say(&self, word: Word) {
         // The daemon has ended if nobody hears it.
@@ -146,60 +238,75 @@ impl Pair {
     /// # Errors
     /// [`PairError`].
     pub fn start_with(rig: &Rig, config: RobotConfig) -> Result<Self, PairError> {
+        Self::start_as(rig, config, None)
+    }
+
+    /// As [`Pair::start`], with disciplined clocks at the robot and at the operators.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn start_disciplined(
+        rig: &Rig,
+        robot: External,
+        operators: External,
+    ) -> Result<Self, PairError> {
+        Self::start_as(rig, Default::default(), Some((robot, operators)))
+    }
+
+    fn start_as(
+        rig: &Rig,
+        config: RobotConfig,
+        external: Option<(External, External)>,
+    ) -> Result<Self, PairError> {
         let network = Network::new();
         let clock = HostClock::from_zero();
         let robot_identity = Identity::ephemeral()?;
         let operator_identity = Identity::ephemeral()?;
-        let (rings, handle) = servo::rings();
-        let mut core = rig.servo(rings);
-        let period = Duration::from_secs_f64(core.tick_s());
-        tokio::task::spawn_local(async move {
-            let mut tick = interval(period);
-            tick.set_missed_tick_behavior(MissedTickBehavior::Burst);
-            loop {
-                tick.tick().await;
-                core.tick(clock.now());
-            }
-        });
-        let socket = quic::Socket::Abstract {
-            socket: network.socket(host(1)),
-            seed: [1; 32],
-        };
-        let endpoint = quic::server(
+        let trust = Trust::new([operator_identity.fingerprint()]);
+        let robots = external.as_ref().map(|(robot, _)| robot.clone());
+        let robot = Robot::start(
+            &network,
+            clock,
+            rig,
             &robot_identity,
-            vec![operator_identity.fingerprint()],
-            socket,
-            &Meter::default(),
+            &trust,
+            config,
+            robots,
         )?;
-        let daemon = RobotDaemon::new(endpoint, clock, rig.info(), config, handle, None);
-        let (quit, quit_rx) = watch::channel(false);
-        let (tx, mut rx) = mpsc::unbounded_channel();
-        let (words, words_rx) = mpsc::unbounded_channel();
-        tokio::task::spawn_local(daemon.run(quit_rx, words_rx, tx));
-        let robot = Robot {
-            reports: Rc::default(),
-            notices: Rc::default(),
-            quit,
-            words,
-        };
-        let log = robot.clone();
-        tokio::task::spawn_local(async move {
-            while let Some(notice) = rx.recv().await {
-                match notice {
-                    RobotNotice::Report(report) => log.reports.borrow_mut().push(*report),
-                    other => log.notices.borrow_mut().push(other),
-                }
-            }
-        });
         Ok(Self {
             network,
             robot,
+            trust,
             clock,
+            config,
+            external,
             robot_identity,
             operator_identity,
             operators: 0,
             learning: Learning::default(),
         })
+    }
+
+    /// Kills the robot, as a power cut does, and starts it again at once: the same key, the same address, the arm in its
+    /// start posture, no session, no model.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn restart_robot(&mut self, rig: &Rig) -> Result<(), PairError> {
+        self.robot.kill(&self.network);
+        let identity = &self.robot_identity;
+        let external = self.external.as_ref().map(|(robot, _)| robot.clone());
+        let (network, clock) = (&self.network, self.clock);
+        self.robot = Robot::start(
+            network,
+            clock,
+            rig,
+            identity,
+            &self.trust,
+            self.config,
+            external,
+        )?;
+        Ok(())
     }
 
     /// Now on the common clock.
@@ -253,19 +360,51 @@ impl Pair {
     pub fn operator_as(
         &mut self,
         identity: &Identity,
-        mut task: Task,
+        task: Task,
         skill: Option<Arc<Skill>>,
         config: SessionConfig,
         link: &LinkConfig,
         seed: u64,
     ) -> Result<Operator, PairError> {
-        let (endpoint, meter) = self.client(identity, link, seed)?;
+        let trust = Trust::new([self.robot_identity.fingerprint()]);
+        self.operator_with(identity, trust, task, (skill, config), link, seed)
+    }
+
+    /// As [`Pair::operator`], without a skill, for a robot with the key `robot`.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn operator_that_expects(
+        &mut self,
+        robot: Fingerprint,
+        task: Task,
+        link: &LinkConfig,
+        seed: u64,
+    ) -> Result<Operator, PairError> {
+        let identity = self.operator_identity_copy()?;
+        let driving = (None, SessionConfig::default());
+        self.operator_with(&identity, Trust::new([robot]), task, driving, link, seed)
+    }
+
+    fn operator_with(
+        &mut self,
+        identity: &Identity,
+        trust: Trust,
+        mut task: Task,
+        (skill, config): (Option<Arc<Skill>>, SessionConfig),
+        link: &LinkConfig,
+        seed: u64,
+    ) -> Result<Operator, PairError> {
+        let (endpoint, meter) = self.client(identity, &trust, link, seed)?;
+        let (endpoint_copy, addr) = (endpoint.clone(), host(1 + self.operators));
         let daemon = OperatorDaemon {
             endpoint,
+            trust,
             meter,
             robot: host(1),
             clock: self.clock,
             epoch: SESSION_ZERO,
+            external: self.external.as_ref().map(|(_, operator)| operator.clone()),
             skill,
             recogniser: None,
             config,
@@ -282,6 +421,8 @@ impl Pair {
         Ok(Operator {
             done,
             notices,
+            addr,
+            endpoint: endpoint_copy,
             quit,
             words,
         })
@@ -293,7 +434,32 @@ impl Pair {
     /// [`PairError`].
     pub fn stranger(&mut self, link: &LinkConfig, seed: u64) -> Result<quinn::Endpoint, PairError> {
         let identity = self.operator_identity_copy()?;
-        Ok(self.client(&identity, link, seed)?.0)
+        let trust = Trust::new([self.robot_identity.fingerprint()]);
+        Ok(self.client(&identity, &trust, link, seed)?.0)
+    }
+
+    /// A client that wants to be paired, on this link.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn suitor(
+        &mut self,
+        identity: &Identity,
+        link: &LinkConfig,
+        seed: u64,
+    ) -> Result<quinn::Endpoint, PairError> {
+        let socket = self.place(link, seed);
+        Ok(quic::pairing_client(identity, socket)?)
+    }
+
+    /// The robot's key.
+    pub fn robot_key(&self) -> Fingerprint {
+        self.robot_identity.fingerprint()
+    }
+
+    /// The operator's, which the robot trusts from the start.
+    pub fn operator_key(&self) -> Fingerprint {
+        self.operator_identity.fingerprint()
     }
 
     /// Where the robot listens.
@@ -312,19 +478,22 @@ impl Pair {
     fn client(
         &mut self,
         identity: &Identity,
+        trust: &Trust,
         link: &LinkConfig,
         seed: u64,
     ) -> Result<(quinn::Endpoint, Meter), PairError> {
+        let (socket, meter) = (self.place(link, seed), Meter::default());
+        Ok((quic::client(identity, trust, socket, &meter)?, meter))
+    }
+
+    /// The socket of one more client.
+    fn place(&mut self, link: &LinkConfig, seed: u64) -> quic::Socket {
         self.operators += 1;
-        let own = host(1 + self.operators);
         self.set_link(self.operators, link, seed);
-        let meter = Meter::default();
-        let socket = quic::Socket::Abstract {
-            socket: self.network.socket(own),
+        quic::Socket::Abstract {
+            socket: self.network.socket(host(1 + self.operators)),
             seed: [self.operators + 1; 32],
-        };
-        let endpoint = quic::client(identity, self.robot_identity.fingerprint(), socket, &meter)?;
-        Ok((endpoint, meter))
+        }
     }
 
     fn operator_identity_copy(&self) -> Result<Identity, IdentityError> {

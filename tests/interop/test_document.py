@@ -3,7 +3,8 @@
 import unittest
 
 import document
-from telemime import codec, frames, greeting, lease, messages, path, plan, predict, rotation, skill, spline, state
+from telemime import (
+    bend, codec, frames, greeting, lease, messages, pairing, path, plan, predict, rotation, skill, spline, state)  # fmt: skip
 
 STATE = bytes.fromhex("fc808d5b00 fb401ffb9f0ffb50c3 050afc0018f70132ec0250e205")
 PARAMS = {"gain": 255, "inflation": 136, "weights": [[230, 10, 10], [180, 40, 30], [128, 60, 50]]}
@@ -44,7 +45,7 @@ class Document(unittest.TestCase):
         kinds = {
             "operator control": "engage-mirror engage-play path reset",
             "robot control": "info engaged refused state",
-            "operator datagram": "motion motion-pose go pong stop",
+            "operator datagram": "motion motion-pose go go-bend pong stop clock",
             "robot datagram": "ping telemetry",
         }
         for kind, names in kinds.items():
@@ -121,6 +122,24 @@ class Document(unittest.TestCase):
         for name, value in zip("xva", spline.of_plan(p).at(0.1)):
             self.near(says[f"plan {name}(0.1)"], value)
 
+    def test_bend(self):
+        says = document.numbers("bend")
+        bent = messages.read("operator datagram", document.example("go-bend"))["Go"]["bend"]
+        self.near(says["bend plan(3.4)"], [bend.plan_time(bent, 0.2)])
+        self.near(says["bend offset(3.4)"], bend.offset(bent, 0.2, 0.21))
+
+    def test_pairing(self):
+        offer = {"Offer": {"name": "laptop"}}
+        commit = {"Commit": {"commitment": pairing.commitment(bytes([0x22] * 32)), "name": "arm"}}
+        abort = {"Abort": {"code": 4, "text": "no"}}
+        for name, message in [("pair-offer", offer), ("pair-commit", commit), ("pair-abort", abort)]:
+            data = document.example(name)
+            self.assertEqual(pairing.encode(message), data)
+            self.assertEqual(pairing.parse(data), (message, len(data)))
+            self.assertIsNone(pairing.parse(data[:-1]))
+        code = pairing.code(*(bytes([n] * 32) for n in (0xE5, 0x0A, 0x0B, 0x11, 0x22)))
+        self.assertEqual(" ".join(document.numbers("pairing")["pairing code"]), code)
+
     def test_lease(self):
         self.assertEqual(lease.until(10.0, 0.65, 0.2), 10.65)
         self.assertAlmostEqual(lease.until(10.0, 0.65, 0.7), 10.45)
@@ -184,7 +203,7 @@ def example():
         "name": "wave", "duration_s": 2.0, "pace": [0.75, 0.125],
         "motion": [{"weight": 1.0, "mean": [1.0, 0.5, 0.0, 2.0], "covariance": sum(unit, [])}],
         "predictor": {
-            "mean": [0.0] * 15, "scale": [0.5] * 15, "covariance": [2.0] * j, "novelty90": 16.0,
+            "mean": [0.0] * 15, "scale": [0.5] * 15, "bend": [0.125, 0.0], "training": [0.03125, 8.0], "covariance": [2.0] * j, "novelty90": 16.0,
             "errors": [[0.03125, 0.0625, 0.25, 0.5]] * j, "lead": [[0.5 * k, 0.0, 0.125 * k, 0.0] for k in range(1, j + 1)],
             "products": [0.25] * 10, "exponents": e,
             "components": [component(0.75, 0, 0.125, 0.25), component(0.25, 1, -0.0625, 0.5)],

@@ -5,7 +5,7 @@ import math
 import pathlib
 import unittest
 
-from telemime import codec, frames, greeting, messages, path, plan, predict, rotation, skill, state
+from telemime import bend, codec, frames, greeting, messages, pairing, path, plan, predict, rotation, skill, state
 
 FILE = pathlib.Path(__file__).resolve().parents[1] / "vectors" / "wire_v1.json"
 VECTORS = json.loads(FILE.read_text(encoding="utf-8"))["vectors"]
@@ -25,6 +25,8 @@ def decode(kind, data):
         return messages.read(kind, data)
     if kind in GREETINGS:
         return greeting.parse(data, GREETINGS[kind])[0]
+    if kind == "pairing":
+        return pairing.parse(data)[0]
     if kind == "frame":
         payload, ignorable, _ = frames.parse(data)
         return {"payload": payload.hex(), "ignorable": ignorable}
@@ -32,7 +34,7 @@ def decode(kind, data):
         return skill.read(data)
     item, limit = {
         "u64": (codec.U64, 16), "i64": (codec.I64, 16), "plan": (plan.PLAN, plan.LONGEST), "state": (state.STATE, 1100),
-        "turn": (state.TURN, 1100)}[kind]  # fmt: skip
+        "turn": (state.TURN, 1100), "bend": (messages.BEND, 1100)}[kind]  # fmt: skip
     return codec.decode(item, data, limit)
 
 
@@ -124,6 +126,21 @@ class Vectors(unittest.TestCase):
             turn = s["turn"] and predict.Model(s["turn"]["predictor"], s["turn"]["charts"])
             for told in value["foretold"]:
                 self.foretold(bytes.fromhex(told["motion"]), told["foretold"], model, turn)
+
+    def test_bends(self):
+        for data, value in self.each("bend"):
+            b = decode("bend", data)
+            for at in value["at"]:
+                self.near(at["plan_s"], bend.plan_time(b, at["h_s"]))
+                self.near(at["offset_m"], bend.offset(b, at["h_s"], at["k_s"]))
+
+    def test_pairing(self):
+        for data, value in self.each("pairing"):
+            message, used = pairing.parse(data)
+            self.assertEqual((used, pairing.encode(message)), (len(data), data))
+            self.assertEqual(message if isinstance(message, str) else {
+                name: {k: v.hex() if isinstance(v, bytes) else v for k, v in fields.items()}
+                for name, fields in message.items()}, value)  # fmt: skip
 
     def test_paths(self):
         for data, value in self.each("path"):

@@ -65,7 +65,7 @@ fn live(recordings: &[Recording], bound_m: f64) -> (f64, f64) {
 }
 
 /// The study's figures (knots a second) are 18, 12.6 and 6.9 for the wave at 10, 20 and 40 mm, 1.4 for
-/// pouring at 1 mm and 6 for the free arm at 10 mm.
+/// pouring at 1 mm and 6 for the free arm at 10 mm; coarser steps take more of them there, and fewer bytes.
 #[test]
 fn the_live_path_holds_its_bound_with_few_knots() {
     for (set, cases) in [
@@ -74,7 +74,7 @@ fn the_live_path_holds_its_bound_with_few_knots() {
             &[(0.010, 19.0), (0.020, 13.5), (0.040, 8.0)][..],
         ),
         ("robottasks/pouring", &[(0.001, 1.8)][..]),
-        ("vr_hvr_ik/free_arm", &[(0.010, 7.0)][..]),
+        ("vr_hvr_ik/free_arm", &[(0.010, 7.5)][..]),
     ] {
         let Some(dir) = folder(set) else { continue };
         let recordings = recordings(&dir);

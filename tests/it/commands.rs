@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 15] = [
+const COMMANDS: [&str; 18] = [
     "demo",
     "import",
     "learn",
@@ -17,6 +17,9 @@ const COMMANDS: [&str; 15] = [
     "codec",
     "robot",
     "operator",
+    "identity",
+    "pair",
+    "peers",
     "link",
     "tap",
     "paper",

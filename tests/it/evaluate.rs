@@ -315,17 +315,17 @@ fn recorded_gestures_meet_the_aims() {
         "0",
     ]);
     let report = json(&args);
-    for (ms, alone, guarded) in [
-        (100.0, 0.40, 0.41),
-        (200.0, 0.36, 0.41),
-        (300.0, 0.34, 0.45),
+    for (ms, bounds) in [
+        (100.0, [0.40, 0.41, 0.43]),
+        (200.0, [0.36, 0.39, 0.42]),
+        (300.0, [0.34, 0.37, 0.45]),
     ] {
-        let (a, g) = (
-            ratio(&report, "mixture alone", ms),
-            ratio(&report, "guarded", ms),
-        );
-        println!("{ms} ms: mixture {a:.3}, guarded {g:.3}");
-        assert!(a < alone && g < guarded, "{ms} ms: {a} and {g}");
+        let names = ["mixture alone", "guard, rest unseen", "guarded"];
+        for (name, bound) in names.into_iter().zip(bounds) {
+            let ratio = ratio(&report, name, ms);
+            println!("{name}, {ms} ms: {ratio:.3}");
+            assert!(ratio < bound, "{name}, {ms} ms: {ratio}");
+        }
     }
     assert_eq!(report["position"]["above"].as_array().unwrap().len(), 0);
     // Messages a second and error, as issue 5 wants them.

@@ -25,11 +25,12 @@ use crate::scene::{delayed, finish, mirroring, rig, shaped};
 /// Dials again and again, for ever.
 fn dials(endpoint: Endpoint, robot: SocketAddr) {
     tokio::task::spawn_local(async move {
+        let mut again = tokio::time::interval(Duration::from_millis(5));
         loop {
             if let Ok(connecting) = endpoint.connect(robot, "telemime") {
                 let _ = connecting.await;
             }
-            tokio::time::sleep(Duration::from_millis(5)).await;
+            again.tick().await;
         }
     });
 }

@@ -153,13 +153,14 @@ fn learn(demonstrations: &[Demonstration]) -> Arc<Skill> {
     Arc::new(learn_skill("gesture", demonstrations, &options, |_| {}).unwrap())
 }
 
-fn must_hold([clean, single, double]: &[[Errors; 2]; 3]) {
+/// Clean data suffer by at most the factor `cost`; of the error with glitches at most the share `left` is left.
+fn must_hold([clean, single, double]: &[[Errors; 2]; 3], cost: f64, left: f64) {
     let costs = clean[1].ratio() / clean[0].ratio();
-    assert!(costs < 1.01, "clean data suffer: {costs}");
+    assert!(costs < cost, "clean data suffer: {costs}");
     let false_alarms = f64::from(clean[1].glitches) / clean[1].samples as f64;
     assert!(false_alarms < 0.005, "{false_alarms} of clean samples");
     for glitched in [single, double] {
-        assert!(glitched[1].ratio() < 0.9 * glitched[0].ratio());
+        assert!(glitched[1].ratio() < left * glitched[0].ratio());
         assert!(glitched[1].ratio() < 1.15 * clean[0].ratio());
     }
 }
@@ -178,7 +179,7 @@ fn a_generated_hand_keeps_its_prediction_through_glitches() {
         (0..4).map(move |i| (Arc::clone(&skill), swing(person, 5 + i)))
     });
     let cases: Vec<_> = cases.into_iter().flatten().collect();
-    must_hold(&table("generated", &cases));
+    must_hold(&table("generated", &cases), 1.01, 0.7);
 }
 
 #[test]
@@ -201,5 +202,6 @@ fn real_gestures_keep_their_prediction_through_glitches() {
             cases.push((learn(&train[..train.len().min(3)]), truth.collect()));
         }
     }
-    must_hold(&table("utd_mhad", &cases));
+    // Real swings jump as glitches do: why the gate is off unless it is asked for.
+    must_hold(&table("utd_mhad", &cases), 1.1, 0.98);
 }

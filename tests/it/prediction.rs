@@ -8,8 +8,9 @@ use std::path::Path;
 use crate::data::{data, needs};
 use nalgebra::{Matrix3, SMatrix, Vector3};
 use telemime_operator::demonstration::Demonstration;
-use telemime_operator::learn::PredictorOptions;
-use telemime_operator::learn::predictor::{states, train, train_from_labels};
+use telemime_operator::learn::predictor::{
+    Character, PredictorOptions, states, train, train_from_labels,
+};
 use telemime_operator::session::adapt::Adaptation;
 use telemime_protocol::predict::{Forecast, KNOT_SPACING_S, Model};
 use telemime_protocol::wire::v1::WireParams;
@@ -49,6 +50,12 @@ fn the_reference_answer_is_reproduced() {
         .collect();
     let options = PredictorOptions {
         knots: 9,
+        characters: vec![Character {
+            bend: 0.0,
+            ..Character::ABRUPT
+        }],
+        copies: 0.0,
+        as_queried: false,
         ..PredictorOptions::default()
     };
     let model = train_from_labels(&demos, &labels, &options).unwrap();
@@ -203,19 +210,25 @@ pub(crate) fn by_person(folder: &Path) -> Vec<Vec<Demonstration>> {
     groups.into_values().collect()
 }
 
-/// Leaves out each performance of a group in turn, trains on (at most `most` of) the others.
-fn evaluate(groups: &[Vec<Demonstration>], most: usize) -> Scores {
+/// Leaves out each performance of a group in turn, trains on (at most `most` of) the others, with those of the
+/// other groups to lean on if `lean`.
+fn evaluate(groups: &[Vec<Demonstration>], most: usize, lean: bool) -> Scores {
     let mut scores = Scores::default();
-    for group in groups {
+    for (person, group) in groups.iter().enumerate() {
+        let rest = groups.iter().enumerate().filter(|(p, _)| *p != person);
+        let others: Vec<Demonstration> = match lean {
+            true => rest.flat_map(|(_, g)| g).cloned().collect(),
+            false => Vec::new(),
+        };
         for (held, test) in group.iter().enumerate() {
-            let mut others = group.clone();
-            others.remove(held);
-            others.truncate(most);
-            if others.is_empty() {
+            let mut own = group.clone();
+            own.remove(held);
+            own.truncate(most);
+            if own.is_empty() {
                 continue;
             }
-            let model = train(&others, &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
-            score(&model, reach_m(&others), test, &mut scores);
+            let model = train(&own, &others, &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
+            score(&model, reach_m(&own), test, &mut scores);
         }
     }
     scores
@@ -279,20 +292,16 @@ fn report(set: &str, scores: &Scores) {
 /// The knots at which predictions are judged: 100, 200 and 300 ms.
 const JUDGED: [usize; 3] = [3, 6, 9];
 
-/// Ratios to hold at 100, 200 and 300 ms that the mixture must reach within 5 %, and those of what the session sends.
-/// Fused, the same prediction may not be worse than the best that needs no model by more than 5 %, and its region of 90 %
-/// holds 80 to 97 %.
-fn must_reach(set: &str, mixture: [f64; 3], fused: [f64; 3]) {
-    let Some(folder) = needs(&format!("data/demos/{set}")) else {
-        return;
-    };
-    let scores = evaluate(&by_person(&folder), 3);
-    report(set, &scores);
-    for (name, bar) in [("gmr", mixture), ("fused", fused)] {
+/// Ratios to hold at 100, 200 and 300 ms that the mixture must reach within 2 %, and those of what the session sends within
+/// 5 %; returns the latter. Fused, the same prediction may not be worse than the best that needs no model by more than 5 %,
+/// and its region of 90 % holds 80 to 99.5 %.
+fn must_reach(set: &str, scores: &Scores, mixture: [f64; 3], fused: [f64; 3]) -> [f64; 3] {
+    report(set, scores);
+    for (name, bar, slack) in [("gmr", mixture, 1.02), ("fused", fused, 1.05)] {
         for (knot, bar) in JUDGED.into_iter().zip(bar) {
             let ratio = scores.ratio(name, knot);
             assert!(
-                ratio < 1.05 * bar,
+                ratio < slack * bar,
                 "{set}, {name}, knot {knot}: {ratio:.3} against {bar}"
             );
         }
@@ -310,52 +319,85 @@ fn must_reach(set: &str, mixture: [f64; 3], fused: [f64; 3]) {
             "{set}, knot {knot}: {held:.3} of 0.9"
         );
     }
+    JUDGED.map(|knot| scores.ratio("fused", knot))
 }
 
-/// The mixture's figures are those of the numpy prototype, on the same split. A clip begins where the hand does: what rests
-/// there is soon taken to rest, which costs what is fused the first moments.
+/// The prototype's mixture gives .403/.373/.351, .393/.331/.285, .332/.318/.299, .423/.393/.372 and .517/.504/.528 here.
+/// A clip begins where the hand does: what rests there is soon taken to rest, which costs what is fused the first moments.
 #[test]
-#[allow(clippy::approx_constant, reason = "0.318 is a measured ratio")]
-fn gestures_are_predicted_as_well_as_by_the_prototype() {
-    for (set, prototype, fused) in [
-        (
-            "utd_mhad/a03_wave",
-            [0.403, 0.373, 0.351],
-            [0.417, 0.397, 0.392],
-        ),
-        (
-            "utd_mhad/a01_swipe_left",
-            [0.393, 0.331, 0.285],
-            [0.406, 0.355, 0.321],
-        ),
-        (
-            "utd_mhad/a09_circle_cw",
-            [0.332, 0.318, 0.299],
-            [0.345, 0.343, 0.332],
-        ),
-        (
-            "utd_mhad/a15_tennis_swing",
-            [0.423, 0.393, 0.372],
-            [0.442, 0.422, 0.392],
-        ),
-        (
-            "kard/a01_horizontal_arm_wave",
-            [0.517, 0.504, 0.528],
-            [0.514, 0.518, 0.554],
-        ),
-    ] {
-        must_reach(set, prototype, fused);
+fn gestures_are_predicted_better_than_by_the_prototype() {
+    let mut product = [1.0_f64; 3];
+    for (set, [mixture, fused]) in GESTURES {
+        let Some(folder) = needs(&format!("data/demos/{set}")) else {
+            return;
+        };
+        let scores = evaluate(&by_person(&folder), 3, false);
+        let fused = must_reach(set, &scores, mixture, fused);
+        if set.starts_with("utd_mhad") {
+            product.iter_mut().zip(fused).for_each(|(p, r)| *p *= r);
+        }
+    }
+    let mean = product.map(|p| p.powf(0.25));
+    println!("utd_mhad, geometric mean: {mean:.3?}");
+}
+
+/// Of the mixture alone, and fused.
+const GESTURES: [(&str, [[f64; 3]; 2]); 5] = [
+    (
+        "utd_mhad/a03_wave",
+        [[0.388, 0.360, 0.348], [0.417, 0.397, 0.392]],
+    ),
+    (
+        "utd_mhad/a01_swipe_left",
+        [[0.380, 0.322, 0.284], [0.406, 0.355, 0.321]],
+    ),
+    (
+        "utd_mhad/a09_circle_cw",
+        [[0.322, 0.307, 0.288], [0.345, 0.343, 0.332]],
+    ),
+    (
+        "utd_mhad/a15_tennis_swing",
+        [[0.415, 0.388, 0.370], [0.442, 0.422, 0.392]],
+    ),
+    (
+        "kard/a01_horizontal_arm_wave",
+        [[0.508, 0.485, 0.507], [0.514, 0.518, 0.554]],
+    ),
+];
+
+/// What other people's demonstrations are worth where there are two own ones.
+#[test]
+fn other_people_help_where_own_demonstrations_are_few() {
+    let set = "kard/a01_horizontal_arm_wave";
+    let Some(folder) = needs(&format!("data/demos/{set}")) else {
+        return;
+    };
+    let groups = by_person(&folder);
+    let alone = evaluate(&groups[..5], 2, false);
+    let together = evaluate(&groups[..5], 2, true);
+    report(set, &together);
+    for knot in JUDGED {
+        let (alone, together) = (alone.ratio("gmr", knot), together.ratio("gmr", knot));
+        assert!(
+            together < 0.97 * alone,
+            "knot {knot}: {together} against {alone}"
+        );
     }
 }
 
-/// A straight line beats the mixture here; together they beat both.
+/// Tasks shown with care are found to be smooth, and then the mixture is as good as a straight line at 100 ms and
+/// much better beyond; as an abrupt gesture, it leaves twice the error.
 #[test]
-fn a_slow_smooth_task_is_not_left_to_the_mixture() {
-    must_reach(
-        "robottasks/pouring",
-        [0.14, 0.16, 0.18],
-        [0.067, 0.096, 0.122],
-    );
+fn a_smooth_task_is_recognised_and_its_mixture_beats_the_straight_line() {
+    let set = "robottasks/pouring";
+    let Some(folder) = needs(&format!("data/demos/{set}")) else {
+        return;
+    };
+    let scores = evaluate(&by_person(&folder), 3, false);
+    must_reach(set, &scores, [0.065, 0.087, 0.108], [0.067, 0.096, 0.122]);
+    for knot in JUDGED {
+        assert!(scores.ratio("gmr", knot) < scores.ratio("cv", knot));
+    }
 }
 
 /// Motion that was never demonstrated, of the same person or of another world.
@@ -379,7 +421,7 @@ fn off_the_model_nothing_is_worse_than_standing_still_by_a_tenth() {
     for (learned, people) in &groups {
         let mut taught = people[0].clone();
         taught.truncate(3);
-        let model = train(&taught, &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
+        let model = train(&taught, &[], &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
         for (set, people) in groups.iter().filter(|(set, _)| set != learned) {
             let mut together = Scores::default();
             for test in people[0].iter().take(2) {

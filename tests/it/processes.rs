@@ -2,7 +2,7 @@
 //!
 //! Nothing here asserts a time; whatever is waited for has a generous limit.
 
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
@@ -78,6 +78,12 @@ impl Process {
                 return event;
             }
         }
+    }
+
+    /// Types a line at its terminal.
+    fn types(&mut self, line: &str) {
+        let stdin = self.child.stdin.as_mut().unwrap();
+        writeln!(stdin, "{line}").unwrap();
     }
 
     fn signal(&self, signal: Signal) {
@@ -264,6 +270,124 @@ fn a_foreign_key_is_refused_at_both_ends_with_a_remedy() {
     assert!(said.contains("does not accept our key"), "{said}");
     robot.event("refused");
     drop(robot.child.stdin);
+}
+
+#[test]
+fn two_hosts_pair_drive_by_name_and_part_by_revocation() {
+    let _alone = alone();
+    let stage = Stage::new();
+    let (robots, operators) = (stage.text("robots-peers"), stage.text("operators-peers"));
+    let mut robot = Process::start(&[
+        "robot",
+        "--listen",
+        "127.0.0.1:0",
+        "--identity",
+        &stage.text("robot.key"),
+        "--peer-file",
+        &robots,
+        "--name",
+        "lab-arm",
+        "--pair",
+        "--clock-dispersion",
+        "50us",
+        "--json",
+        "--follow-stdin",
+    ]);
+    let addr = robot.event("listening")["addr"]
+        .as_str()
+        .unwrap()
+        .to_owned();
+    assert_eq!(robot.event("pairing")["stage"], "open");
+    let mut laptop = Process::start(&[
+        "pair",
+        &addr,
+        "--identity",
+        &stage.text("operator.key"),
+        "--peer-file",
+        &operators,
+        "--name",
+        "laptop",
+        "--json",
+    ]);
+    let here = laptop.event("code");
+    let there = robot.event_where("pairing", |e| e["stage"] == "code");
+    assert_eq!(
+        (&here["code"], &here["name"]),
+        (&there["code"], &"lab-arm".into())
+    );
+    assert_eq!(there["name"], "laptop");
+    laptop.types("yes");
+    assert!(!Path::new(&robots).exists() && !Path::new(&operators).exists());
+    robot.types("yes");
+    robot.event_where("pairing", |e| e["stage"] == "paired");
+    laptop.event("paired");
+    assert!(laptop.end().0.success());
+
+    let start = || {
+        Process::start(&[
+            "operator",
+            "--connect",
+            "lab-arm",
+            "--identity",
+            &stage.text("operator.key"),
+            "--peer-file",
+            &operators,
+            "--learn",
+            &stage.text("swing"),
+            "--replay",
+            &stage.text("unseen.csv"),
+            "--clock-dispersion",
+            "50us",
+            "--json",
+            "--follow-stdin",
+        ])
+    };
+    let operator = start();
+    operator.event("engaged");
+    // One host, one clock: both ends' wall clocks are the same to the nanosecond.
+    operator.event_where("telemetry", |e| {
+        e["clock_uncertainty_ms"].as_f64().unwrap() < 0.2
+    });
+    let revoke = Process::start(&["peers", "revoke", "laptop", "--file", &robots, "--json"]);
+    assert!(revoke.end().0.success());
+    let ended = robot.event("disconnected");
+    assert!(
+        ended["why"].as_str().unwrap().contains("revoked"),
+        "{ended}"
+    );
+    assert_eq!(ended["clock_origin"], "disciplined");
+    robot.event_where("state", |e| e["state"] == "Holding");
+    let (status, said) = operator.end();
+    assert!(!status.success());
+    assert!(said.contains("has revoked our key"), "{said}");
+    let refused = robot.event("refused");
+    assert_eq!(
+        (&refused["reason"], &refused["times"]),
+        (&"revoked_key".into(), &1.into())
+    );
+
+    // A robot with another key in its place is refused before anything is sent.
+    robot.signal(Signal::TERM);
+    assert!(robot.end().0.success());
+    let impostor = Process::start(&[
+        "robot",
+        "--listen",
+        &addr,
+        "--identity",
+        &stage.text("stranger.key"),
+        "--peer-file",
+        &robots,
+        "--json",
+        "--follow-stdin",
+    ]);
+    impostor.event("listening");
+    let (status, said) = start().end();
+    assert!(!status.success());
+    assert!(
+        said.contains("has another key than the one we know"),
+        "{said}"
+    );
+    drop(impostor.child.stdin);
 }
 
 #[test]

@@ -15,15 +15,18 @@ use telemime_protocol::predict::{
 };
 use telemime_protocol::skill::{Gmm, Pace, Parts, Provenance, Samples, Skill, Source, Stats};
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::{self, Frame};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
+use telemime_protocol::wire::pair::{self, AbortCode, Name, PairMessage, Transcript};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::{
-    self, Cause, Drive, Engage, Info, Message, Motion, OperatorControl, OperatorDatagram, PathTail,
-    Refusal, RobotControl, RobotDatagram, RobotState, Telemetry, WireParams, model_tag,
+    self, Cause, Drive, Engage, ExternalClock, Info, Message, Motion, OperatorControl,
+    OperatorDatagram, PathTail, Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
+    WireParams, model_tag,
 };
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo;
@@ -51,6 +54,23 @@ const TURN: WireTurn = WireTurn {
         inflation: 128,
         weights: [[0, 0, 200]; 3],
     },
+};
+
+const BEND: WireBend = WireBend {
+    plan_us: 1_500_000,
+    rate: 64,
+    left: [200, 0, -50],
+    held: Some(WireHeld {
+        state: WireState {
+            t_us: 3_190_000,
+            x: [0, 800, -10],
+            memory_exponent: 3,
+            memory: [[0, 40, -1], [0, 90, -2], [1, 120, -4], [1, 125, -4]],
+        },
+        gain: 255,
+        straight: 128,
+        weight: [64, 10, 100, 0, -5, 127],
+    }),
 };
 
 const TIP_Q: WireRotation = WireRotation([7_869, -3_976, 0]);
@@ -153,6 +173,9 @@ fn skill() -> Skill {
         Standardisation {
             mean: SVector::zeros(),
             scale: SVector::repeat(0.5),
+            bend: [0.125, 0.0],
+            ridge: 0.03125,
+            shrinkage: 8.0,
         },
         vec![
             component(0.75, 0.0, 0.125, 0.25),
@@ -247,6 +270,17 @@ fn telemetry() -> Telemetry {
 fn message<M: Message + PartialEq + Debug>(message: &M) -> Vec<u8> {
     let bytes = message.encode();
     assert_eq!(M::decode(&bytes).as_ref(), Ok(message));
+    bytes
+}
+
+fn name(text: &str) -> Name {
+    Name::new(text).unwrap()
+}
+
+fn pairing(message: PairMessage) -> Vec<u8> {
+    let bytes = message.encode();
+    let used = bytes.len();
+    assert_eq!(PairMessage::decode(&bytes), Ok(Some((message, used))));
     bytes
 }
 
@@ -362,6 +396,18 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
                 seq: 43,
                 t_us: 3_200_000,
                 lease_ms: 650,
+                bend: None,
+            }),
+        ),
+        (
+            "go-bend",
+            message(&OperatorDatagram::Go {
+                epoch: 7,
+                engagement: 2,
+                seq: 44,
+                t_us: 3_200_000,
+                lease_ms: 650,
+                bend: Some(BEND),
             }),
         ),
         (
@@ -375,6 +421,16 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
         ),
         ("stop", message(&OperatorDatagram::Stop { epoch: 7 })),
         (
+            "clock",
+            message(&OperatorDatagram::Clock {
+                epoch: 7,
+                clock: ExternalClock {
+                    ahead_us: 1_792_000_000_000_000,
+                    dispersion_us: 50,
+                },
+            }),
+        ),
+        (
             "ping",
             message(&RobotDatagram::Ping {
                 epoch: 7,
@@ -383,6 +439,18 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
         ),
         ("telemetry", message(&RobotDatagram::Telemetry(telemetry()))),
         ("plan", codec::encode(&plan())),
+        ("pair-offer", pairing(PairMessage::Offer(name("laptop")))),
+        (
+            "pair-commit",
+            pairing(PairMessage::Commit(
+                pair::commitment(&[0x22; 32]),
+                name("arm"),
+            )),
+        ),
+        (
+            "pair-abort",
+            pairing(PairMessage::Abort(AbortCode::Declined, "no".into())),
+        ),
     ])
 }
 
@@ -391,6 +459,14 @@ fn values() -> BTreeMap<String, String> {
     let mut say = |name: &str, value: String| {
         assert!(values.insert(name.to_owned(), value).is_none(), "{name}");
     };
+    let agreed = Transcript {
+        exporter: [0xe5; 32],
+        operator: [0x0a; 32],
+        robot: [0x0b; 32],
+        operator_nonce: [0x11; 32],
+        robot_nonce: [0x22; 32],
+    };
+    say("pairing code", agreed.code().to_string());
     let vector = |v: &Vector3<f64>| format!("{:.9} {:.9} {:.9}", v.x, v.y, v.z);
 
     let state = STATE.dequantise();
@@ -475,6 +551,10 @@ fn values() -> BTreeMap<String, String> {
     say("plan x(0.1)", vector(&jet.x));
     say("plan v(0.1)", vector(&jet.v));
     say("plan a(0.1)", vector(&jet.a));
+
+    let bend = BEND.dequantise();
+    say("bend plan(3.4)", format!("{:.9}", bend.plan_at(0.2)));
+    say("bend offset(3.4)", vector(&bend.offset_at(0.2, 0.21)));
     values
 }
 

@@ -66,10 +66,9 @@ fn a_fourth_demonstration_is_worth_nearly_what_it_is_from_the_start() {
         four += error_m(&batch, &test).ln() / 8.0;
 
         assert!((new.duration_s() - batch.duration_s()).abs() < 1e-9);
-        assert_eq!(
-            new.parts().samples.predictor,
-            batch.parts().samples.predictor
-        );
+        // Copies at other paces count by their weight, rounded.
+        let rows = |s: &Skill| s.parts().samples.predictor;
+        assert!(rows(&new).abs_diff(rows(&batch)) <= 1);
         assert_eq!(new.provenance().sources, batch.provenance().sources);
         assert_eq!(
             (new.stats().min, new.stats().max),

@@ -67,7 +67,8 @@ fn session(
             bound_s < 0.25 && offset_s.abs() < 1e4,
             "{offset_s} {bound_s}"
         );
-        assert_eq!(dropped, 0);
+        // One of a dial that came too late.
+        assert!(dropped <= 1, "{dropped}");
         Ok(told.expect("connected"))
     })
     .unwrap()

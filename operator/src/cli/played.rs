@@ -2,6 +2,7 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_protocol::checkpoint::PoseCurve;
+use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{RobotState, Telemetry};
 
 use super::report::{Event, Scores, TurnScores};
@@ -19,6 +20,8 @@ pub(super) struct Played {
     tip: Vec<(f64, Vector3<f64>)>,
     /// The same for its orientation, where that is followed.
     turn: Vec<(f64, UnitQuaternion<f64>)>,
+    /// What the robot was told to make of the plan, if a hand corrected it.
+    bends: Vec<session::Bent>,
     /// Ticks on which a limit held the arm back.
     clamps: u32,
 }
@@ -46,6 +49,7 @@ impl Played {
             engaged: None,
             tip: Vec::new(),
             turn: Vec::new(),
+            bends: Vec::new(),
             clamps: 0,
         }
     }
@@ -76,6 +80,7 @@ impl Played {
                 });
             }
             session::Event::Telemetry(telemetry) => self.take(telemetry),
+            session::Event::Bent(bent) => self.bends.push(*bent),
             _ => {}
         }
     }
@@ -104,13 +109,18 @@ impl Played {
         let (sent, followed): (Vec<_>, Vec<_>) = self
             .tip
             .iter()
-            .filter(|(t_s, _)| *t_s <= end_s)
-            .map(|(t_s, tip)| (self.curve.position_at(*t_s), *tip))
+            .map(|(t_s, tip)| (self.meant_at(*t_s), *tip))
+            .filter(|((plan_s, _), _)| *plan_s <= end_s)
+            .map(|((_, meant), tip)| (meant, tip))
             .unzip();
         if sent.len() < 2 {
             return None;
         }
-        let demonstrations = self.demonstrations.as_ref().map(|aligned| {
+        let uncorrected = self
+            .demonstrations
+            .as_ref()
+            .filter(|_| self.bends.is_empty());
+        let demonstrations = uncorrected.map(|aligned| {
             Scores::of_demonstrations(aligned, |t_s| self.tip_at(t_s.clamp(0.0, end_s)))
         });
         Some(Event::Played {
@@ -119,13 +129,21 @@ impl Played {
             rebuilt_to_tip: Scores::of(&sent, &followed),
             demonstrations_to_tip: demonstrations,
             turn_to_tip: (!self.turn.is_empty()).then(|| {
-                TurnScores::of(
-                    self.turn
-                        .iter()
-                        .filter_map(|(t_s, q)| Some(self.curve.orientation_at(*t_s)?.angle_to(q))),
-                )
+                TurnScores::of(self.turn.iter().filter_map(|(t_s, q)| {
+                    let plan_s = self.meant_at(*t_s).0;
+                    Some(self.curve.orientation_at(plan_s)?.angle_to(q))
+                }))
             }),
         })
+    }
+
+    /// The plan's time (s) and where the hand belongs (m), `t_s` after the engage.
+    fn meant_at(&self, t_s: f64) -> (f64, Vector3<f64>) {
+        let engaged_us = self.engaged.as_ref().map_or(0, |engaged| engaged.t_us);
+        let t = Stamp(engaged_us.saturating_mul(1000)).offset_by_secs(t_s);
+        let bent = session::Bent::among(&self.bends, t);
+        let (plan_s, offset) = bent.map_or((t_s, Vector3::zeros()), |b| (b.plan_s, b.offset_m));
+        (plan_s, self.curve.position_at(plan_s) + offset)
     }
 
     /// Linear between what was heard.

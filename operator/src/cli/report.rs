@@ -14,7 +14,7 @@ use super::played::Played;
 use crate::daemon::{Notice, Summary};
 use crate::learn::align::Aligned;
 use crate::recognise::Verdict;
-use crate::session;
+use crate::session::{self, Change};
 use crate::task::{Outcome, Task};
 
 /// A motion that explains less of the tip's was not followed.
@@ -191,6 +191,18 @@ pub enum Event {
         phase: f64,
         mono_ns: i64,
     },
+    Correction {
+        what: String,
+        mono_ns: i64,
+    },
+    Bent {
+        plan_s: f64,
+        rate: f64,
+        share: f64,
+        hand_m: Option<[f64; 3]>,
+        offset_m: [f64; 3],
+        mono_ns: i64,
+    },
     Progress {
         done: f64,
     },
@@ -340,7 +352,8 @@ impl Event {
             ),
             Self::Recognised { what, .. } if what == "none of these" => format!("hand: {what}"),
             Self::Recognised { .. } => return None,
-            Self::Progress { .. } | Self::Telemetry { .. } => return None,
+            Self::Correction { what, .. } => format!("hand: {what}"),
+            Self::Progress { .. } | Self::Telemetry { .. } | Self::Bent { .. } => return None,
             Self::Played {
                 samples,
                 clamps,
@@ -538,6 +551,24 @@ pub(super) async fn listen_to(
                         mono_ns: at.0 + epoch.0,
                     }
                 }
+                session::Event::Correction(change) => Event::Correction {
+                    what: match change {
+                        Change::Grabbed => "grabbed",
+                        Change::TakenOver => "taken over",
+                        Change::Released => "released",
+                        Change::Lost => "lost",
+                    }
+                    .to_owned(),
+                    mono_ns: at.0 + epoch.0,
+                },
+                session::Event::Bent(bent) => Event::Bent {
+                    plan_s: bent.plan_s,
+                    rate: bent.rate,
+                    share: bent.share,
+                    hand_m: bent.hand_m.map(Into::into),
+                    offset_m: bent.offset_m.into(),
+                    mono_ns: bent.at.0 + epoch.0,
+                },
                 session::Event::Telemetry(t) => {
                     let uncertainty_ms = f64::from(t.clock_uncertainty_us) * 1e-3;
                     bar.set_message(format!(

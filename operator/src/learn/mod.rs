@@ -127,6 +127,9 @@ pub enum LearnError {
         /// The frame.
         name: String,
     },
+    /// Nothing that the motion may be like.
+    #[error("no character to choose from: give one at least")]
+    NoCharacter,
     /// The data span no volume, and no ridge was allowed.
     #[error("the data lie in a subspace: no mixture of full covariance fits without a ridge")]
     Singular,
@@ -145,6 +148,9 @@ pub struct LearnOptions {
     pub motion_components: std::ops::RangeInclusive<usize>,
     /// The predictor.
     pub predictor: PredictorOptions,
+    /// The same motion by other people, for the predictor of positions: it leans on them where the own demonstrations
+    /// have nothing to say. They are no sources of the skill.
+    pub others: Vec<Demonstration>,
     /// Frames that the motion is also learned relative to: [`frames::START`], [`frames::GOAL`], and what the
     /// recordings place by `# frame` lines. None, and it is not.
     pub frames: Vec<String>,
@@ -157,6 +163,7 @@ impl Default for LearnOptions {
         Self {
             motion_components: 1..=MAX_COMPONENTS,
             predictor: PredictorOptions::default(),
+            others: Vec::new(),
             frames: Vec::new(),
             seed: 0,
         }
@@ -210,6 +217,8 @@ pub enum Progress {
         components: usize,
         /// Samples it was trained on.
         samples: usize,
+        /// Whether the motion was found to be smooth rather than abrupt.
+        smooth: bool,
     },
 }
 
@@ -254,6 +263,7 @@ pub fn learn_skill(
     };
     let predictor = predictor::train(
         demonstrations,
+        &options.others,
         &options.predictor,
         options.seed,
         &mut progress,
@@ -286,7 +296,7 @@ pub fn learn_skill(
         grip,
         task,
         stats: statistics(demonstrations),
-        samples: samples(&aligned, demonstrations),
+        samples: samples(&aligned, demonstrations, options.predictor.copies),
         provenance: provenance(demonstrations, options.seed),
     })?)
 }
@@ -335,11 +345,14 @@ fn pace(demonstrations: &[Demonstration]) -> Pace {
     }
 }
 
-fn samples(aligned: &align::Aligned, demonstrations: &[Demonstration]) -> Samples {
+fn samples(aligned: &align::Aligned, demonstrations: &[Demonstration], copies: f64) -> Samples {
+    let rows = demonstrations
+        .iter()
+        .map(|d| predictor::row_count(d, copies));
     let count = |n: usize| u32::try_from(n).unwrap_or(u32::MAX).max(1);
     Samples {
         motion: count(aligned.paths.len() * aligned.times_s.len()),
-        predictor: count(demonstrations.iter().map(predictor::row_count).sum()),
+        predictor: count(rows.sum::<f64>().round() as usize),
     }
 }
 

@@ -150,7 +150,10 @@ pub fn refine(skill: &Skill, d: &Demonstration) -> Result<(Skill, Refinement), L
     parts.pace = pace(&old.pace, d.duration_s(), before as f64);
     let count = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
     parts.samples.motion = old.samples.motion.saturating_add(count(warped.len()));
-    parts.samples.predictor = old.samples.predictor.saturating_add(count(refined.rows));
+    parts.samples.predictor = old
+        .samples
+        .predictor
+        .saturating_add(count(refined.rows.round() as usize));
     parts.provenance.sources.push(Source {
         name: short(d.name()),
         sha256: *d.sha256(),

@@ -17,6 +17,9 @@ pub(crate) const CHI2_3_90: f64 = 6.251;
 const LEAST_M2: f64 = 1e-8;
 const LEAST_NOVELTY: f64 = 1.0;
 
+/// Knots (from 1) by whose errors a character is chosen: 100 to 300 ms, where predictions are used.
+const CHOSEN_BY: std::ops::RangeInclusive<usize> = 3..=9;
+
 /// Experts in the order of [`Calibration::errors`].
 const MIXTURE: usize = 0;
 const GENERIC: usize = 1;
@@ -94,6 +97,15 @@ impl<C: Course> Trial<C> {
                 }
             }
         }
+    }
+
+    /// The mixture's mean square error over that of holding, summed over the knots that count; 0 if none was tried.
+    pub(super) fn ratio(&self) -> f64 {
+        let each = CHOSEN_BY.filter_map(|j| {
+            let errors = self.errors.get(j - 1)?;
+            Some(errors[MIXTURE].mean()? / errors[HOLD].mean()?)
+        });
+        each.sum()
     }
 
     /// The share of the states tried whose novelty is above `limit`; 0 of none.

@@ -174,7 +174,7 @@ impl<const D: usize> Prior<D> {
                 return Err(LearnError::Prior { found: value });
             }
         }
-        let all = of_labels(data, &vec![0; data.len()], 1).swap_remove(0);
+        let all = of_labels(data, |_| 1.0, &vec![0; data.len()], 1).swap_remove(0);
         Ok(Self {
             weights: options.weights,
             concentration,
@@ -264,7 +264,7 @@ fn run<const D: usize>(
     prior: &Prior<D>,
     options: &VariationalOptions,
 ) -> Result<Variational<D>, LearnError> {
-    let mut moments = of_labels(data, labels, options.components);
+    let mut moments = of_labels(data, |_| 1.0, labels, options.components);
     let mut trace: Vec<f64> = Vec::new();
     let mut previous = f64::NEG_INFINITY;
     let mut converged = false;

@@ -1,7 +1,9 @@
 //! One skill, prepared for being recognised.
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
-use telemime_protocol::predict::{FEATURES, KNOT_SPACING_S, Regression, TEMPER};
+use telemime_protocol::predict::{
+    BENT, FEATURES, KNOT_SPACING_S, Regression, Standardisation, TEMPER,
+};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 
@@ -47,7 +49,7 @@ struct Part {
 /// A skill as a density over the hand's states, with its phases.
 #[derive(Debug, Clone)]
 pub(super) struct Known {
-    mean: Features,
+    units: Standardisation,
     per_scale: Features,
     parts: Vec<Part>,
     /// The d² that one sample in ten of a held-out performance exceeds.
@@ -93,7 +95,7 @@ impl Known {
             source,
         })?;
         Ok(Self {
-            mean: units.mean,
+            units: units.clone(),
             per_scale: units.scale.map(|s| 1.0 / s),
             logs: vec![0.0; parts.len()],
             parts,
@@ -110,7 +112,8 @@ impl Known {
     /// Strange is a state far from every component, and a position far from where the states of 200 ms ago
     /// would have had the hand by now.
     pub(super) fn judge(&mut self, t: Stamp, f: &Features) -> (f64, f64) {
-        let z = (f - self.mean).component_mul(&self.per_scale);
+        let bent = self.units.bent(*f);
+        let z = (bent - self.units.mean).component_mul(&self.per_scale);
         let mut nearest = f64::INFINITY;
         let mut most = f64::NEG_INFINITY;
         for (l, p) in self.logs.iter_mut().zip(&self.parts) {
@@ -133,7 +136,8 @@ impl Known {
         let (displacement, covariance) = self.displacement(&z, most);
         self.foretold
             .remember(t, self.ahead_s, x + displacement, covariance);
-        (most + sum.ln(), SHARES[0] * here + SHARES[1] * missed)
+        let density = most + sum.ln() + log_jacobian(f, &self.units.bend);
+        (density, SHARES[0] * here + SHARES[1] * missed)
     }
 
     /// The displacement to the knot and its covariance, responsibilities tempered as the predictor's are.
@@ -155,7 +159,7 @@ impl Known {
 
     /// Moves on the belief about the phase by `dt_s` and weighs it with the features.
     pub(super) fn progress(&mut self, f: &Features, dt_s: f64, weight: f64) {
-        self.phases.take(f, dt_s, weight);
+        self.phases.take(&self.units.bent(*f), dt_s, weight);
     }
 
     /// Mean and standard deviation of the phase, in [0, 1].
@@ -167,6 +171,22 @@ impl Known {
         self.foretold = Foretold::default();
         self.phases.reset();
     }
+}
+
+/// ln of what a volume of features is multiplied by where they are bent: without it, densities of skills that
+/// bend differently would not compare.
+///
+/// A length r becomes g = b·ln(1 + r/b), so it is stretched by 1/(1 + r/b) along itself and by g/r across.
+fn log_jacobian(f: &Features, bend: &[f64; BENT]) -> f64 {
+    let of = |(i, &b): (usize, &f64)| {
+        let r = f.fixed_rows::<3>(3 * (i + 1)).norm() / b;
+        if r > 0.0 && r.is_finite() {
+            2.0 * (r.ln_1p() / r).ln() - r.ln_1p()
+        } else {
+            0.0
+        }
+    };
+    bend.iter().enumerate().map(of).sum()
 }
 
 impl Part {

@@ -51,7 +51,7 @@ impl Phases {
             let t_s = i as f64 * step_s;
             state.advance(Stamp::from_secs_f64(t_s), at(t_s));
             if i % FINER == 0 {
-                templates.push(state.features().component_mul(&per_unit));
+                templates.push(units.bent(state.features()).component_mul(&per_unit));
             }
         }
         let mut phases = Self {

@@ -206,9 +206,18 @@ fn a_faster_sensor_sees_the_same() {
             slow[(30.0 * second) as usize],
             fast[(120.0 * second) as usize],
         );
-        assert_eq!(a.verdict, b.verdict, "{second}");
         assert!((a.phase - b.phase).abs() < 0.05, "{second}: {a:?} {b:?}");
+        assert!(
+            (a.novelty - b.novelty).abs() < 0.15,
+            "{second}: {a:?} {b:?}"
+        );
     }
+    // Where the novelty touches the limit, the sensors' noise decides.
+    let under_way = 20..80;
+    let alike = under_way
+        .clone()
+        .filter(|&i| slow[i].verdict == fast[4 * i].verdict);
+    assert!(alike.count() as f64 > 0.95 * under_way.len() as f64);
 }
 
 #[test]

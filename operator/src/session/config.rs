@@ -30,10 +30,13 @@ pub struct SessionConfig {
     pub path_bound_m: Option<f64>,
     /// The input's own latency, s: how long after it was valid a sample is handed over. It is subtracted from the sample's time.
     pub input_latency_s: f64,
-    /// What a tracker gets wrong for a frame or two is replaced by its prediction.
+    /// What a tracker gets wrong for a frame or two is replaced by its prediction. For trackers that do: a hand that
+    /// jumps farther than it ever did is believed two samples later.
     pub glitch_gate: bool,
     /// Prediction gain κ in [0, 1].
     pub gain: f64,
+    /// How exactly the hand means its displacement when it corrects what is played, m: the smaller, the more it bends it.
+    pub hand_sigma_m: f64,
     /// Tip metres per hand metre; `None` derives it from the demonstrations and the arm's limits.
     pub scale: Option<f64>,
     /// Hand axes to the robot's base axes.
@@ -48,11 +51,12 @@ impl Default for SessionConfig {
             max_silence_s: 0.2,
             min_interval_s: 0.01,
             lease_s: 0.65,
-            future_bound: FutureBound::Relative(0.6),
+            future_bound: FutureBound::Relative(1.0),
             path_bound_m: None,
             input_latency_s: 0.0,
-            glitch_gate: true,
+            glitch_gate: false,
             gain: 1.0,
+            hand_sigma_m: 0.02,
             scale: None,
             rotation: UnitQuaternion::identity(),
             versions: Versions::default(),

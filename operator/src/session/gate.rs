@@ -114,17 +114,17 @@ fn foretold(
     let usual_m_s = skill.map_or(UNKNOWN_M_S, |skill| skill.stats().speed95_m_s);
     let usual_m = SPEED * usual_m_s * ahead_s;
     let strayed = (sample.x - there.position).norm() > most(there.sigma_m, SENSOR_M).max(usual_m);
-    let turned = hand.turn.zip(sample.orientation).and_then(|(state, seen)| {
+    let turned = hand.turn.zip(sample.orientation).map(|(state, seen)| {
         let forecast = match skill.and_then(Skill::turn) {
             Some(turned) => turned.predictor.forecast(&state, turn),
             None => TurnForecast::constant_velocity(&state, turn),
         };
         let there = forecast.at(ahead_s);
         let away_rad = there.orientation.angle_to(&seen);
-        Some((
+        (
             there.orientation,
             away_rad > most(there.sigma_rad, SENSOR_RAD),
-        ))
+        )
     });
     if !strayed && !turned.is_some_and(|(_, away)| away) {
         return None;

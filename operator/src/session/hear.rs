@@ -35,6 +35,7 @@ impl Session {
                 if let Activity::Play {
                     plan,
                     engaged: engaged @ false,
+                    ..
                 } = &mut self.activity
                     && *plan == id
                 {
@@ -52,6 +53,9 @@ impl Session {
                 tip_q,
             } => {
                 self.before = None;
+                if let Some(correction) = self.correction() {
+                    correction.begin(Stamp(t_us.saturating_mul(1000)));
+                }
                 self.events.push_back(Event::Engaged {
                     engagement,
                     t_us,
@@ -66,7 +70,7 @@ impl Session {
                 {
                     mirror.go_without_model();
                 } else {
-                    self.let_go();
+                    self.end_activity();
                     // What was sent for nothing is not what following took.
                     if let Some(before) = self.before.take() {
                         let dropped = self.counters.dropped;
@@ -98,6 +102,9 @@ impl Session {
                     t2_us: t_us,
                     t3_us: t_us,
                 });
+                if let Some(clock) = self.external {
+                    self.datagram(&OperatorDatagram::Clock { epoch, clock });
+                }
             }
             Ok(RobotDatagram::Telemetry(telemetry)) if telemetry.epoch == self.epoch => {
                 if let Activity::Mirror(mirror) = &mut self.activity
@@ -140,11 +147,11 @@ impl Session {
         match state {
             RobotState::Stopped => {
                 self.next_stop = None;
-                self.let_go();
+                self.end_activity();
             }
             // The robot let go by itself: the clutch must be pressed again.
-            RobotState::Holding => self.let_go(),
-            RobotState::Ready if cause == Cause::PlanFinished => self.let_go(),
+            RobotState::Holding => self.end_activity(),
+            RobotState::Ready if cause == Cause::PlanFinished => self.end_activity(),
             _ => {}
         }
         self.events.push_back(Event::State(state, cause));

@@ -4,7 +4,9 @@
 //! both are empty, then [`Session::poll_timeout`] for when to call [`Session::handle_timeout`].
 
 pub mod adapt;
+mod beside;
 mod config;
+mod correct;
 mod gate;
 mod hand;
 mod hear;
@@ -23,14 +25,17 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::Version;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::v1::{
-    Drive, Engage, Info, Message, OperatorControl, OperatorDatagram, PathTail, Refusal, RobotState,
+    Drive, Engage, ExternalClock, Info, Message, OperatorControl, OperatorDatagram, PathTail,
+    Refusal, RobotState,
 };
 
 use crate::recognise::{Recogniser, Verdict};
 
 pub use config::{FutureBound, HandSample, SessionConfig, default_scale};
+pub use correct::{Bent, Change, LOST_S, Leeway};
 pub use said::{Counters, Event, Output};
 
+use correct::Correction;
 use gate::{Gate, Taken};
 use hand::{Hand, Interval};
 use mirror::Mirror;
@@ -48,6 +53,8 @@ enum Activity {
     Play {
         plan: u32,
         engaged: bool,
+        /// What the hand makes of it, if it may.
+        correction: Option<Box<Correction>>,
     },
 }
 
@@ -69,6 +76,7 @@ pub struct Session {
     gate: Gate,
     interval: Interval,
     recogniser: Option<Recogniser>,
+    external: Option<ExternalClock>,
     verdict: Option<Verdict>,
     activity: Activity,
     engagement: u32,
@@ -104,6 +112,7 @@ impl Session {
             gate: Gate::default(),
             interval: Interval::default(),
             recogniser: None,
+            external: None,
             verdict: None,
             activity: Activity::Nothing,
             engagement: 0,
@@ -133,6 +142,11 @@ impl Session {
     pub fn watched_by(mut self, recogniser: Option<Recogniser>) -> Self {
         self.recogniser = recogniser;
         self
+    }
+
+    /// What our disciplined clock says now, relative to the session clock, if we have one.
+    pub fn set_external(&mut self, external: Option<ExternalClock>) {
+        self.external = external;
     }
 
     /// What the robot said of itself.
@@ -179,9 +193,19 @@ impl Session {
         self.config.path_bound_m.unwrap_or(derived).max(1e-4)
     }
 
-    /// The hand, live. Samples out of order or not finite are dropped and counted.
+    /// The hand, live: mirrored, or, where a skill is played that may be corrected, a hand that holds on to it until
+    /// [`Session::let_go`]. Samples out of order or not finite are dropped and counted.
     pub fn handle_sample(&mut self, now: Stamp, mut sample: HandSample) {
         sample.t = sample.t.offset_by_secs(-self.config.input_latency_s);
+        if matches!(
+            self.activity,
+            Activity::Play {
+                correction: Some(_),
+                ..
+            }
+        ) {
+            return self.correct(now, &sample);
+        }
         let Some(hand) = &mut self.hand else {
             self.hand = Hand::first(&sample);
             return;
@@ -227,11 +251,7 @@ impl Session {
         if mirror.future_changed(arrival, self.config.future_bound)
             || silent_s >= self.config.max_silence_s
         {
-            // Within the shortest interval the news waits, and what is then said is the newest.
-            self.urgent = silent_s < self.config.min_interval_s;
-            if !self.urgent {
-                self.speak(now);
-            }
+            self.speak_soon(now);
         }
         if let Some(tail) = backlog {
             self.path(tail);
@@ -241,6 +261,20 @@ impl Session {
     /// What the robot calls delay is the age of a sample: the input's latency and the network's.
     fn network_delay_s(&self) -> f64 {
         (self.delay_s - self.config.input_latency_s).max(0.0)
+    }
+
+    /// When what is said now takes effect at the arm.
+    fn ahead(&self, now: Stamp) -> Stamp {
+        let lag_s = self.info.as_ref().map_or(0.0, |info| f64::from(info.lag_s));
+        now.offset_by_secs(self.delay_s + lag_s)
+    }
+
+    /// Within the shortest interval the news waits, and what is then said is the newest.
+    fn speak_soon(&mut self, now: Stamp) {
+        self.urgent = now.secs_since(self.last_sent) < self.config.min_interval_s;
+        if !self.urgent {
+            self.speak(now);
+        }
     }
 
     fn recognise(&mut self, hand: &Hand) {
@@ -292,15 +326,29 @@ impl Session {
         self.last_sent = now;
     }
 
-    /// Sends a motion and plays it as soon as the robot has it.
-    pub fn play(&mut self, plan: &PosePlan) {
+    /// Sends a motion and plays it as soon as the robot has it. With the skill's `leeway` the hand may correct it:
+    /// [`Session::handle_sample`], [`Session::let_go`].
+    pub fn play(&mut self, plan: &PosePlan, leeway: Option<&Leeway>) {
         if self.refuses() {
             return;
         }
+        let correction = match leeway.map(|leeway| (plan.curve(), leeway)) {
+            Some((Ok(curve), leeway)) => Some(Box::new(Correction::new(
+                curve,
+                leeway.clone(),
+                &self.config,
+            ))),
+            Some((Err(_), _)) => {
+                self.events.push_back(Event::Refused(Refusal::BadPlan));
+                return;
+            }
+            None => None,
+        };
         self.plans += 1;
         self.activity = Activity::Play {
             plan: self.plans,
             engaged: false,
+            correction,
         };
         self.control(&OperatorControl::Plan {
             id: self.plans,
@@ -322,13 +370,13 @@ impl Session {
             self.control(&OperatorControl::Release {
                 engagement: self.engagement,
             });
-            self.let_go();
+            self.end_activity();
         }
     }
 
     /// Emergency stop: on the stream, and by datagram until the robot says it has stopped.
     pub fn stop(&mut self, now: Stamp) {
-        self.let_go();
+        self.end_activity();
         self.control(&OperatorControl::EmergencyStop);
         self.next_stop = Some(now);
     }
@@ -364,6 +412,9 @@ impl Session {
         if self.next_word().is_some_and(|due| now >= due) {
             self.speak(now);
         }
+        if self.next_look().is_some_and(|due| now >= due) {
+            self.look_after(now);
+        }
     }
 
     /// What to send next.
@@ -382,9 +433,16 @@ impl Session {
         let word = self
             .next_word()
             .map(|due| (due, "confirm before the silence grows too long"));
-        match (stop, word) {
-            (Some(a), Some(b)) => Some(if b.0 < a.0 { b } else { a }),
-            (a, b) => a.or(b),
+        let look = self
+            .next_look()
+            .map(|due| (due, "see what the hand makes of the plan"));
+        [stop, word, look].into_iter().flatten().min_by_key(|w| w.0)
+    }
+
+    fn next_look(&self) -> Option<Stamp> {
+        match &self.activity {
+            Activity::Play { correction, .. } => correction.as_ref()?.due(),
+            _ => None,
         }
     }
 
@@ -417,7 +475,7 @@ impl Session {
     }
 
     /// Nothing is driven any more.
-    fn let_go(&mut self) {
+    fn end_activity(&mut self) {
         if let Activity::Mirror(mirror) = std::mem::replace(&mut self.activity, Activity::Nothing)
             && self.before.is_none()
         {
@@ -434,10 +492,13 @@ impl Session {
             } else {
                 self.config.max_silence_s
             })),
-            Activity::Play { engaged: true, .. } => Some(
-                self.last_sent
-                    .offset_by_secs(self.config.max_silence_s.min(GO_S)),
-            ),
+            Activity::Play { engaged: true, .. } => Some(self.last_sent.offset_by_secs(
+                self.config.max_silence_s.min(if self.urgent {
+                    self.config.min_interval_s
+                } else {
+                    GO_S
+                }),
+            )),
         }
     }
 
@@ -448,15 +509,23 @@ impl Session {
         self.seq += 1;
         let lease_ms = (self.config.lease_s * 1e3) as u16;
         let network_s = self.network_delay_s();
+        let ahead = self.ahead(now);
         let datagram = match &mut self.activity {
             Activity::Nothing => return,
-            Activity::Play { .. } => OperatorDatagram::Go {
-                epoch: self.epoch,
-                engagement: self.engagement,
-                seq: self.seq,
-                t_us: now.0 / 1000,
-                lease_ms,
-            },
+            Activity::Play { correction, .. } => {
+                let told = correction.as_mut().and_then(|c| c.tell(now, ahead));
+                if let Some((_, bent)) = told {
+                    self.events.push_back(Event::Bent(bent));
+                }
+                OperatorDatagram::Go {
+                    epoch: self.epoch,
+                    engagement: self.engagement,
+                    seq: self.seq,
+                    t_us: now.0 / 1000,
+                    lease_ms,
+                    bend: told.map(|(wire, _)| wire),
+                }
+            }
             Activity::Mirror(mirror) => {
                 let skill = self.skill.as_deref().filter(|_| self.model_stored);
                 let Some(mut motion) = mirror.motion(skill, now, network_s) else {

@@ -1,5 +1,6 @@
 //! What a session says: bytes to send, events, counts.
 
+use super::correct::{Bent, Change};
 use crate::recognise::Verdict;
 use nalgebra::UnitQuaternion;
 use telemime_protocol::wire::v1::{Cause, Refusal, RobotState, Telemetry};
@@ -53,6 +54,10 @@ pub enum Event {
         /// How far it has got, in [0, 1].
         phase: f64,
     },
+    /// A hand takes hold of what is played, or lets it go.
+    Correction(Change),
+    /// What the robot was told to make of the plan.
+    Bent(Bent),
     /// News of the robot.
     Telemetry(Box<Telemetry>),
 }

@@ -14,6 +14,7 @@ use telemime_protocol::wire::v1::{Cause, RobotControl, RobotDatagram, Telemetry}
 use super::*;
 
 mod commands;
+mod correcting;
 mod gating;
 mod mirroring;
 mod posing;

@@ -140,6 +140,12 @@ pub enum Word {
     Stop,
     /// `reset`: leave the latched stop.
     Reset,
+    /// `pair` or `pair 30s`: open a pairing window.
+    Pair(Duration),
+    /// `yes`: the codes are the same.
+    Yes,
+    /// `no`: they are not.
+    No,
     /// `keep`: the performance just driven is worth learning from.
     Keep,
     /// `refine`: learn from what was kept.
@@ -148,8 +154,14 @@ pub enum Word {
     Save(PathBuf),
 }
 
+/// How long a window is open that was asked for without saying how long.
+pub const PAIRING_WINDOW: Duration = Duration::from_secs(60);
+
+/// The longest pairing window.
+pub const LONGEST_WINDOW: Duration = Duration::from_secs(600);
+
 /// What a robot's terminal understands.
-pub const ROBOT_WORDS: &str = "stop, reset or quit";
+pub const ROBOT_WORDS: &str = "stop, reset, pair, yes, no or quit";
 
 /// What an operator's terminal understands.
 pub const OPERATOR_WORDS: &str = "stop, reset, keep, refine, save FILE or quit";
@@ -165,12 +177,45 @@ impl Word {
         match (word, rest.trim()) {
             ("stop", "") => Some(Self::Stop),
             ("reset", "") => Some(Self::Reset),
+            ("pair", "") => Some(Self::Pair(PAIRING_WINDOW)),
+            ("pair", span) => seconds(span).ok().map(Self::Pair),
+            ("yes", "") => Some(Self::Yes),
+            ("no", "") => Some(Self::No),
             ("keep", "") => Some(Self::Keep),
             ("refine", "") => Some(Self::Refine),
             ("save", file) if !file.is_empty() => Some(Self::Save(file.into())),
             _ => None,
         }
     }
+}
+
+/// A length of time of whole or broken seconds: `60s`, `60` or `0.5s`; at most ten minutes.
+///
+/// # Errors
+/// One line that says what to write.
+pub fn seconds(text: &str) -> Result<Duration, String> {
+    let number = text.strip_suffix('s').unwrap_or(text).parse::<f64>();
+    let number = number
+        .ok()
+        .filter(|s| *s > 0.0 && *s <= LONGEST_WINDOW.as_secs_f64());
+    number
+        .map(Duration::from_secs_f64)
+        .ok_or_else(|| format!("`{text}`: write seconds, for example 60s, and at most 600s"))
+}
+
+/// How wrong a disciplined clock may be: `50us`, `0.2ms` or `0.001s`, at most a second.
+///
+/// # Errors
+/// One line that says what to write.
+pub fn dispersion(text: &str) -> Result<Duration, String> {
+    let scaled = [("us", 1e-6), ("ms", 1e-3), ("s", 1.0)]
+        .into_iter()
+        .find_map(|(unit, s)| Some((text.strip_suffix(unit)?, s)));
+    let seconds = scaled.and_then(|(number, s)| Some(number.trim().parse::<f64>().ok()? * s));
+    seconds
+        .filter(|s| *s > 0.0 && *s <= 1.0)
+        .map(Duration::from_secs_f64)
+        .ok_or_else(|| format!("`{text}`: write for example 50us or 2ms, at most 1s"))
 }
 
 /// Resolves once the watch is true, or its sender is gone.
@@ -265,5 +310,35 @@ mod tests {
             Ok(SocketAddr::from(([127, 0, 0, 1], 80)))
         );
         assert!(resolve("127.0.0.1").is_err());
+    }
+
+    #[test]
+    fn a_dispersion_has_a_unit_and_a_limit() {
+        for (text, us) in [("50us", 50), ("0.2ms", 200), ("1s", 1_000_000)] {
+            assert_eq!(dispersion(text), Ok(Duration::from_micros(us)));
+        }
+        for bad in ["", "50", "us", "-1ms", "0s", "2s", "nans", "50 minutes"] {
+            assert!(dispersion(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn words_are_understood_whole_or_not_at_all() {
+        for (line, meant) in [
+            (" stop ", Some(Word::Stop)),
+            ("reset", Some(Word::Reset)),
+            ("pair", Some(Word::Pair(PAIRING_WINDOW))),
+            ("pair 0.5s", Some(Word::Pair(Duration::from_millis(500)))),
+            ("yes", Some(Word::Yes)),
+            ("no", Some(Word::No)),
+            ("", None),
+            ("stop it", None),
+            ("pair 0", None),
+            ("pair 601s", None),
+            ("pair soon", None),
+            ("pair nan", None),
+        ] {
+            assert_eq!(Word::parse(line.trim(), ROBOT_WORDS), meant, "{line}");
+        }
     }
 }

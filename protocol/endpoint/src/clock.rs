@@ -1,8 +1,11 @@
 //! The host's monotonic clock, which paused tokio time can stand in for.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::Duration;
 
 use rustix::time::{ClockId, clock_gettime};
+use telemime_protocol::wire::v1::ExternalClock;
 use tokio::time::Instant;
 
 /// A moment on the host's monotonic clock (`CLOCK_MONOTONIC`), ns. Common to all processes of a host.
@@ -83,6 +86,72 @@ impl HostClock {
     }
 }
 
+/// Seconds since 1970 on the host's wall clock, which may be stepped at any time: to date a note by, nothing else.
+pub fn wall_s() -> i64 {
+    clock_gettime(ClockId::Realtime).tv_sec
+}
+
+/// A clock that is kept right from outside: the host's wall clock, if PTP, chrony or the like disciplines it and
+/// the user says how well.
+///
+/// It is read only relative to the monotonic clock. Both run at the same, disciplined rate, so their difference
+/// changes when somebody sets the wall clock, and at no other time: a step is seen as what it is.
+#[derive(Debug, Clone)]
+pub struct External {
+    wall: Wall,
+    dispersion: Duration,
+}
+
+#[derive(Debug, Clone)]
+enum Wall {
+    Host,
+    Stated(Arc<AtomicI64>),
+}
+
+impl External {
+    /// The host's wall clock (`CLOCK_REALTIME`), never wrong by more than `dispersion`.
+    pub fn host(dispersion: Duration) -> Self {
+        let wall = Wall::Host;
+        Self { wall, dispersion }
+    }
+
+    /// A clock that is ahead of [`HostClock`] by as many ns as `ahead_ns` holds: for virtual time.
+    pub fn stated(ahead_ns: Arc<AtomicI64>, dispersion: Duration) -> Self {
+        let wall = Wall::Stated(ahead_ns);
+        Self { wall, dispersion }
+    }
+
+    /// How far it is ahead of the monotonic clock now, ns.
+    pub fn ahead_ns(&self) -> i64 {
+        match &self.wall {
+            Wall::Stated(ahead_ns) => ahead_ns.load(Ordering::Relaxed),
+            Wall::Host => {
+                let read = |id| {
+                    let now = clock_gettime(id);
+                    now.tv_sec * 1_000_000_000 + now.tv_nsec
+                };
+                let pair = || {
+                    let before = read(ClockId::Monotonic);
+                    let wall = read(ClockId::Realtime);
+                    let gap = read(ClockId::Monotonic) - before;
+                    (gap, wall - (before + gap / 2))
+                };
+                // Put aside in between, a reading would be off by that long: the narrowest of some counts.
+                let narrowest = (0..4).map(|_| pair()).min_by_key(|(gap, _)| *gap);
+                narrowest.map_or(0, |(_, ahead_ns)| ahead_ns)
+            }
+        }
+    }
+
+    /// As it goes over the wire, relative to a clock that shows 0 when the monotonic one shows `zero`.
+    pub fn message(&self, zero: Mono) -> ExternalClock {
+        ExternalClock {
+            ahead_us: self.ahead_ns().saturating_add(zero.0) / 1000,
+            dispersion_us: u32::try_from(self.dispersion.as_micros()).unwrap_or(u32::MAX),
+        }
+    }
+}
+
 impl Default for HostClock {
     fn default() -> Self {
         Self::new()
@@ -92,6 +161,18 @@ impl Default for HostClock {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_wall_clock_runs_beside_the_monotonic_one() {
+        let external = External::host(Duration::from_micros(50));
+        let read = |id| clock_gettime(id).tv_sec;
+        let coarse = read(ClockId::Realtime) - read(ClockId::Monotonic);
+        assert!((external.ahead_ns() / 1_000_000_000 - coarse).abs() <= 1);
+        assert_eq!(external.message(Mono(0)).dispersion_us, 50);
+        let stated = External::stated(Arc::new(AtomicI64::new(7_000)), Duration::from_secs(1));
+        // A session clock that shows 0 at 5 µs is 12 µs behind at any time.
+        assert_eq!(stated.message(Mono(5_000)).ahead_us, 12);
+    }
 
     #[test]
     fn a_pause_between_two_readings_does_not_shift_the_clock() {

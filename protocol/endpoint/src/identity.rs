@@ -7,17 +7,40 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use rcgen::{CertificateParams, KeyPair, PKCS_ED25519, PublicKeyData};
+use ring::hmac;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, PrivatePkcs8KeyDer};
 use sha2::{Digest, Sha256};
 
 /// SHA-256 of a peer's SubjectPublicKeyInfo (RFC 7469 §2.4's pin), written as 64 hexadecimal digits.
-#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Fingerprint([u8; 32]);
 
 impl Fingerprint {
     /// The fingerprint of a DER-encoded SubjectPublicKeyInfo.
     pub fn of_spki(spki: &[u8]) -> Self {
         Self(Sha256::digest(spki).into())
+    }
+
+    /// The 32 bytes of the hash.
+    pub fn bytes(&self) -> [u8; 32] {
+        self.0
+    }
+
+    /// The first 80 bits in four groups of four letters and digits (RFC 4648's base 32, lower case): for people
+    /// to tell keys apart by. A search for another key with the same 80 bits is out of reach.
+    pub fn short(&self) -> String {
+        const ALPHABET: &[u8; 32] = b"abcdefghijklmnopqrstuvwxyz234567";
+        let mut bits = [0; 16];
+        bits[6..].copy_from_slice(&self.0[..10]);
+        let bits = u128::from_be_bytes(bits);
+        let mut out = String::with_capacity(19);
+        for i in 0..16 {
+            if i > 0 && i % 4 == 0 {
+                out.push('-');
+            }
+            out.push(char::from(ALPHABET[(bits >> (75 - 5 * i)) as usize & 31]));
+        }
+        out
     }
 }
 
@@ -189,6 +212,13 @@ impl Identity {
         PrivateKeyDer::Pkcs8(PrivatePkcs8KeyDer::from(self.key.serialize_der()))
     }
 
+    /// The secret that QUIC's stateless reset tokens are made with; it follows from the private key.
+    pub(crate) fn reset_key(&self) -> hmac::Key {
+        let private = hmac::Key::new(hmac::HMAC_SHA256, &self.key.serialize_der());
+        let secret = hmac::sign(&private, b"telemime stateless reset");
+        hmac::Key::new(hmac::HMAC_SHA256, secret.as_ref())
+    }
+
     fn from_key(key: KeyPair) -> Result<Self, IdentityError> {
         // Serial number and dates are fixed by rcgen's defaults, so the certificate follows from the key alone.
         let certificate = CertificateParams::new(vec!["telemime".to_owned()])?
@@ -240,6 +270,12 @@ mod tests {
 
     #[test]
     fn fingerprints_are_parsed_or_refused() {
+        // RFC 4648: ten bytes of ff are sixteen times the last letter.
+        assert_eq!(Fingerprint([0xff; 32]).short(), "7777-7777-7777-7777");
+        assert_eq!(
+            Fingerprint(*b"foobarfoobarfoobarfoobarfoobarfo").short(),
+            "mzxw-6ytb-ojtg-633c"
+        );
         for bad in ["", "12", &"g".repeat(64), &"é".repeat(32)] {
             assert!(bad.parse::<Fingerprint>().is_err(), "{bad}");
         }

@@ -1,14 +1,19 @@
 //! What the two daemons' shells share and the protocol must not know: the host's clock, an identity,
 //! TLS that trusts pinned keys only, and QUIC set up for teleoperation.
 
+pub mod admin;
 pub mod cli;
 pub mod clock;
 pub mod control;
 pub mod identity;
 pub mod meter;
+pub mod pairing;
+pub mod peers;
 pub mod quic;
 pub mod tls;
+pub mod trust;
 
-pub use clock::{HostClock, Mono};
+pub use clock::{External, HostClock, Mono};
 pub use identity::{Fingerprint, Identity, IdentityError};
 pub use meter::Meter;
+pub use trust::{Standing, Trust};

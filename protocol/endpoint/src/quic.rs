@@ -13,11 +13,12 @@ use quinn::{
     ServerConfig, TransportConfig, VarInt,
 };
 use quinn_proto::{RandomConnectionIdGenerator, RttEstimator};
-use telemime_protocol::wire::v1;
+use telemime_protocol::wire::{pair, v1};
 
-use crate::identity::{Fingerprint, Identity};
+use crate::identity::Identity;
 use crate::meter::{CID_LEN, Meter};
 use crate::tls;
+use crate::trust::Trust;
 
 /// Silence after which a connection is given up. Never a safety timer: the motion lease is.
 pub const IDLE_TIMEOUT: Duration = Duration::from_secs(1);
@@ -182,50 +183,74 @@ pub enum EndpointError {
     Cipher(#[from] quinn::crypto::rustls::NoInitialCipherSuite),
 }
 
-/// The robot's endpoint: accepts `peers` and nobody else.
+/// The robot's endpoint: accepts whom `peers` trusts and nobody else.
 ///
 /// # Errors
 /// [`EndpointError`].
 pub fn server(
     identity: &Identity,
-    peers: Vec<Fingerprint>,
+    peers: impl Into<Trust>,
     socket: Socket,
     meter: &Meter,
 ) -> Result<Endpoint, EndpointError> {
-    let crypto = QuicServerConfig::try_from(tls::server(identity, peers, &[v1::ALPN])?)?;
+    let tls = tls::server(identity, peers.into(), &[v1::ALPN, pair::ALPN])?;
+    let crypto = QuicServerConfig::try_from(tls)?;
     let mut config = ServerConfig::with_crypto(Arc::new(crypto));
     config
         .transport_config(Arc::new(transport()))
         .max_incoming(16)
         .incoming_buffer_size(INCOMING_BUFFER)
         .incoming_buffer_size_total(16 * INCOMING_BUFFER);
-    endpoint(Some(config), socket, meter)
+    endpoint(identity, Some(config), socket, meter)
 }
 
-/// The operator's endpoint and the settings to reach `peer` with.
+/// The operator's endpoint and the settings to reach whom `peer` trusts with.
 ///
 /// # Errors
 /// [`EndpointError`].
 pub fn client(
     identity: &Identity,
-    peer: Fingerprint,
+    peer: impl Into<Trust>,
     socket: Socket,
     meter: &Meter,
 ) -> Result<Endpoint, EndpointError> {
-    let crypto = QuicClientConfig::try_from(tls::client(identity, peer, &[v1::ALPN])?)?;
+    client_for(identity, peer.into(), v1::ALPN, socket, meter)
+}
+
+/// The endpoint of an operator that wants to be paired: it talks to anybody, of nothing else.
+///
+/// # Errors
+/// [`EndpointError`].
+pub fn pairing_client(identity: &Identity, socket: Socket) -> Result<Endpoint, EndpointError> {
+    let anybody = Trust::new([]);
+    anybody.set_open(true);
+    client_for(identity, anybody, pair::ALPN, socket, &Meter::default())
+}
+
+fn client_for(
+    identity: &Identity,
+    peer: Trust,
+    alpn: &[u8],
+    socket: Socket,
+    meter: &Meter,
+) -> Result<Endpoint, EndpointError> {
+    let crypto = QuicClientConfig::try_from(tls::client(identity, peer, &[alpn])?)?;
     let mut config = ClientConfig::new(Arc::new(crypto));
     config.transport_config(Arc::new(transport()));
-    let mut endpoint = endpoint(None, socket, meter)?;
+    let mut endpoint = endpoint(identity, None, socket, meter)?;
     endpoint.set_default_client_config(config);
     Ok(endpoint)
 }
 
 fn endpoint(
+    identity: &Identity,
     server: Option<ServerConfig>,
     socket: Socket,
     meter: &Meter,
 ) -> Result<Endpoint, EndpointError> {
-    let mut config = EndpointConfig::default();
+    // The same after a restart: a peer whose session died with the process is told at its next packet, and need not
+    // wait for its idle time-out (RFC 9000 §10.3).
+    let mut config = EndpointConfig::new(Arc::new(identity.reset_key()));
     config.cid_generator(|| Box::new(RandomConnectionIdGenerator::new(CID_LEN)));
     let runtime = Arc::new(quinn::TokioRuntime);
     let socket = match socket {
@@ -243,28 +268,75 @@ fn endpoint(
     )?)
 }
 
+/// The ALPN of a connection whose handshake is complete.
+pub fn alpn(connection: &quinn::Connection) -> Option<Vec<u8>> {
+    let data = connection.handshake_data()?;
+    let data = data
+        .downcast::<quinn::crypto::rustls::HandshakeData>()
+        .ok()?;
+    data.protocol
+}
+
+/// Why TLS ended a handshake, as far as it concerns keys and versions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refusal {
+    /// The peer's key is not pinned here.
+    KeyUnknown,
+    /// The peer's key was revoked here.
+    KeyRevoked,
+    /// Our key is not pinned there.
+    OurKeyUnknown,
+    /// Our key was revoked there.
+    OurKeyRevoked,
+    /// No common ALPN.
+    Version,
+}
+
+// TLS alerts (RFC 8446 §6.2) as QUIC errors (RFC 9001 §4.8).
+const ALERT_REVOKED: u8 = 44;
+const ALERT_ACCESS_DENIED: u8 = 49;
+const ALERT_NO_ALPN: u8 = 120;
+
+/// What a connection's end says about keys and versions, if it does.
+pub fn refusal(error: &quinn::ConnectionError) -> Option<Refusal> {
+    use quinn::ConnectionError as E;
+    let (code, theirs) = match error {
+        E::ConnectionClosed(close) => (close.error_code, true),
+        E::TransportError(e) => (e.code, false),
+        _ => return None,
+    };
+    let alert = |n| quinn::TransportErrorCode::crypto(n) == code;
+    match theirs {
+        _ if alert(ALERT_NO_ALPN) => Some(Refusal::Version),
+        true if alert(ALERT_REVOKED) => Some(Refusal::OurKeyRevoked),
+        true if alert(ALERT_ACCESS_DENIED) => Some(Refusal::OurKeyUnknown),
+        false if alert(ALERT_REVOKED) => Some(Refusal::KeyRevoked),
+        false if alert(ALERT_ACCESS_DENIED) => Some(Refusal::KeyUnknown),
+        _ => None,
+    }
+}
+
 /// A connection's end, in one line a person can act on.
 pub fn explain(error: &quinn::ConnectionError) -> String {
     use quinn::ConnectionError as E;
-    match error {
-        E::TimedOut => "no answer: is the peer running, and does UDP reach it?".into(),
-        E::LocallyClosed => "closed here".into(),
-        E::ApplicationClosed(close) if close.reason.is_empty() => "closed by the peer".into(),
-        E::ApplicationClosed(close) => {
+    match (refusal(error), error) {
+        (Some(Refusal::Version), _) => "the peer speaks no version of Telemime that we know".into(),
+        (Some(Refusal::KeyUnknown), _) => {
+            "the peer's key is not one we know: pair, or compare the fingerprints both ends print with --peer".into()
+        }
+        (Some(Refusal::KeyRevoked), _) => "the peer's key was revoked here".into(),
+        (Some(Refusal::OurKeyUnknown), _) => {
+            "the peer does not accept our key: pair, or add our fingerprint to its --peer".into()
+        }
+        (Some(Refusal::OurKeyRevoked), _) => {
+            "the peer has revoked our key: it must be removed there (`telemime peers remove`) before it can be paired again".into()
+        }
+        (None, E::TimedOut) => "no answer: is the peer running, and does UDP reach it?".into(),
+        (None, E::LocallyClosed) => "closed here".into(),
+        (None, E::ApplicationClosed(close)) if close.reason.is_empty() => "closed by the peer".into(),
+        (None, E::ApplicationClosed(close)) => {
             format!("closed by the peer: {}", String::from_utf8_lossy(&close.reason))
         }
-        E::ConnectionClosed(close) if close.error_code == quinn::TransportErrorCode::crypto(0x78) => {
-            "the peer speaks no version of Telemime that we know".into()
-        }
-        E::TransportError(e) if e.code == quinn::TransportErrorCode::crypto(0x78) => {
-            "the peer speaks no version of Telemime that we know".into()
-        }
-        E::TransportError(e) if e.code.to_string().contains("cryptographic") => {
-            "the peer's key is not the one pinned with --peer: compare the fingerprints both daemons print".into()
-        }
-        E::ConnectionClosed(close) if close.error_code.to_string().contains("cryptographic") => {
-            "the peer does not accept our key: add our fingerprint to its --peer".into()
-        }
-        other => other.to_string(),
+        (None, other) => other.to_string(),
     }
 }

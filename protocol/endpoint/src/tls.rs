@@ -10,16 +10,17 @@ use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::{CertificateError, DigitallySignedStruct, DistinguishedName, Error, SignatureScheme};
 
 use crate::identity::{Fingerprint, Identity};
+use crate::trust::{Standing, Trust};
 
 /// Accepts a certificate if its public key is pinned; names, dates and issuers mean nothing here.
 #[derive(Debug)]
 struct Pinned {
-    peers: Vec<Fingerprint>,
+    peers: Trust,
     provider: Arc<CryptoProvider>,
 }
 
 impl Pinned {
-    fn new(peers: Vec<Fingerprint>) -> Arc<Self> {
+    fn new(peers: Trust) -> Arc<Self> {
         Arc::new(Self {
             peers,
             provider: Arc::new(ring::default_provider()),
@@ -28,13 +29,12 @@ impl Pinned {
 
     fn check(&self, certificate: &CertificateDer<'_>) -> Result<(), Error> {
         let spki = ParsedCertificate::try_from(certificate)?.subject_public_key_info();
-        if self.peers.contains(&Fingerprint::of_spki(&spki)) {
-            Ok(())
-        } else {
-            Err(Error::InvalidCertificate(
-                CertificateError::ApplicationVerificationFailure,
-            ))
-        }
+        let refused = match self.peers.admits(Fingerprint::of_spki(&spki)) {
+            Standing::Trusted => return Ok(()),
+            Standing::Revoked => CertificateError::Revoked,
+            Standing::Unknown => CertificateError::ApplicationVerificationFailure,
+        };
+        Err(Error::InvalidCertificate(refused))
     }
 
     fn signature(
@@ -130,13 +130,13 @@ impl ClientCertVerifier for Pinned {
     }
 }
 
-/// The robot's side: accepts `peers` and nobody else.
+/// The robot's side: accepts whom `peers` trusts and nobody else.
 ///
 /// # Errors
 /// [`Error`] if rustls rejects our own certificate.
 pub fn server(
     identity: &Identity,
-    peers: Vec<Fingerprint>,
+    peers: Trust,
     alpn: &[&[u8]],
 ) -> Result<rustls::ServerConfig, Error> {
     let verifier = Pinned::new(peers);
@@ -147,19 +147,22 @@ pub fn server(
     config.alpn_protocols = alpn.iter().map(|name| name.to_vec()).collect();
     // 0-RTT data can be replayed: no command may travel in it.
     config.max_early_data_size = 0;
+    // A resumed session would not ask for the peer's key again, nor whether it is still trusted.
+    config.session_storage = Arc::new(rustls::server::NoServerSessionStorage {});
+    config.send_tls13_tickets = 0;
     Ok(config)
 }
 
-/// The operator's side: talks to `peer` and nobody else.
+/// The operator's side: talks to whom `peer` trusts and nobody else.
 ///
 /// # Errors
 /// [`Error`] if rustls rejects our own certificate.
 pub fn client(
     identity: &Identity,
-    peer: Fingerprint,
+    peer: Trust,
     alpn: &[&[u8]],
 ) -> Result<rustls::ClientConfig, Error> {
-    let verifier = Pinned::new(vec![peer]);
+    let verifier = Pinned::new(peer);
     let mut config = rustls::ClientConfig::builder_with_provider(verifier.provider.clone())
         .with_protocol_versions(&[&rustls::version::TLS13])?
         .dangerous()
@@ -167,5 +170,6 @@ pub fn client(
         .with_client_auth_cert(vec![identity.certificate()], identity.private_key())?;
     config.alpn_protocols = alpn.iter().map(|name| name.to_vec()).collect();
     config.enable_early_data = false;
+    config.resumption = rustls::client::Resumption::disabled();
     Ok(config)
 }

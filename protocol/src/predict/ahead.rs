@@ -100,7 +100,7 @@ impl Ahead {
     /// What novelty takes from the mixture goes to the others in proportion to their own weights.
     pub fn fused(experts: &Experts, params: &Params) -> Self {
         let mut knots = [STILL; MAX_KNOTS + 1];
-        for j in 1..=experts.count {
+        for (j, knot) in knots.iter_mut().enumerate().take(experts.count + 1).skip(1) {
             let answers = &experts.displacement[j - 1];
             let [mixture, generic, straight] = params.at(j);
             let (weights, hold) = if experts.learned {
@@ -146,7 +146,7 @@ impl Ahead {
             }
             apart(hold, mean);
             let covariance = covariance.map(|v| v * params.inflation);
-            knots[j] = Knot {
+            *knot = Knot {
                 displacement: mean * params.gain,
                 covariance,
                 sigma: ((covariance[0] + covariance[3] + covariance[5]) / 3.0).sqrt(),

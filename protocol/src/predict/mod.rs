@@ -2,23 +2,25 @@
 //!
 //! [`HandState`] is all that is known of the hand, [`Model`] what was learned, [`Params`] what the
 //! operator adapts; [`Model::forecast`] is a pure function of the three, and keeps nothing.
-//! [`TurnState`], [`TurnModel`] and [`TurnForecast`] are the same for its orientation.
+//! [`Bend`] is what a hand makes of a plan that is played. [`TurnState`], [`TurnModel`] and [`TurnForecast`] are the same for its orientation.
 
 mod ahead;
+mod bend;
 mod experts;
 mod forecast;
 mod model;
 mod params;
+mod standard;
 mod state;
 mod turn;
 
 pub use ahead::{Ahead, Knot, Way};
+pub use bend::{Bend, Held, LET_GO_TAU_S, MAX_RATE, PUSH_REACH_S};
 pub use experts::{Experts, Generic};
 pub use forecast::{Forecast, Prediction};
-pub use model::{
-    BLOCK, Calibration, Model, ModelError, Posterior, Regression, Standardisation, TARGETS, TEMPER,
-};
+pub use model::{BLOCK, Calibration, Model, ModelError, Posterior, Regression, TARGETS, TEMPER};
 pub use params::{BAND_KNOTS, Params, ParamsError, WEIGHTED};
+pub use standard::{BENT, Standardisation};
 pub use state::{FEATURES, HandState, MEMORY_TAU_S};
 pub use turn::{TurnForecast, TurnModel, TurnPrediction, TurnState, checksum};
 

@@ -2,6 +2,7 @@
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
+use super::standard::Standardisation;
 use super::state::{FEATURES, HandState};
 use super::{Forecast, Generic, KNOT_SPACING_S, MAX_KNOTS, Params};
 use crate::skill::MAX_COMPONENTS;
@@ -46,6 +47,12 @@ pub enum ModelError {
         /// Where.
         field: &'static str,
     },
+    /// A number that must not be less than zero is.
+    #[error("predictor: {field} is less than zero")]
+    Negative {
+        /// Where.
+        field: &'static str,
+    },
     /// Not one chart for each component.
     #[error("{found} charts for {expected} predictor components")]
     Charts {
@@ -60,15 +67,6 @@ pub enum ModelError {
         /// Index of the component.
         component: usize,
     },
-}
-
-/// The affine map from features in metres to the units the mixture was fitted in.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Standardisation {
-    /// Mean of every feature, m.
-    pub mean: SVector<f64, FEATURES>,
-    /// Scale of every feature, m, > 0; one value within a 3-vector keeps space isotropic.
-    pub scale: SVector<f64, FEATURES>,
 }
 
 /// One component: a Gaussian over the features and a linear regression from them to displacements.
@@ -167,6 +165,9 @@ impl Model {
         }
         finite("a feature mean", standardisation.mean.iter())?;
         positive("a feature scale", standardisation.scale.iter())?;
+        not_negative("a bend", standardisation.bend.iter())?;
+        let training = [standardisation.ridge, standardisation.shrinkage];
+        not_negative("ridge or shrinkage", training.iter())?;
         positive("a covariance factor", calibration.covariance.iter())?;
         positive("a mean squared error", calibration.errors.iter().flatten())?;
         positive("the novelty quantile", [calibration.novelty90].iter())?;
@@ -254,18 +255,21 @@ impl Model {
     /// `l_k = ln π_k − ½‖L_k⁻¹(f−μ_f)‖² − Σ ln diag L_k; r_k ∝ exp(β·l_k); y_k = μ_y + B_kᵀ(f−μ_f);
     /// d = Σ r_k y_k; V = Σ r_k [V_k + (y_k−d)(y_k−d)ᵀ]`
     pub fn posterior(&self, state: &HandState) -> Posterior {
-        let features = state.features();
-        self.posterior_of(|_| features)
+        self.posterior_at(&state.features())
     }
 
-    /// The same from the features (m or rad) that each component, by index, is given.
+    /// The same from the features themselves, m.
+    pub fn posterior_at(&self, features: &SVector<f64, FEATURES>) -> Posterior {
+        let bent = self.standardisation.bent(*features);
+        self.posterior_of(|_| bent)
+    }
+
+    /// The same from the bent features (m or rad) that each component, by index, is given.
     pub(super) fn posterior_of(
         &self,
         mut features: impl FnMut(usize) -> SVector<f64, FEATURES>,
     ) -> Posterior {
-        let mut standardised = |k| {
-            (features(k) - self.standardisation.mean).component_div(&self.standardisation.scale)
-        };
+        let mut standardised = |k| self.standardisation.scaled(&features(k));
         let mut shares = [0.0; MAX_COMPONENTS];
         let shares = &mut shares[..self.components.len()];
         let mut novelty = f64::INFINITY;
@@ -336,6 +340,18 @@ fn finite<'a>(
         Ok(())
     } else {
         Err(ModelError::NotFinite { field })
+    }
+}
+
+fn not_negative<'a>(
+    field: &'static str,
+    mut values: impl Iterator<Item = &'a f64> + Clone,
+) -> Result<(), ModelError> {
+    finite(field, values.clone())?;
+    if values.all(|&v| v >= 0.0) {
+        Ok(())
+    } else {
+        Err(ModelError::Negative { field })
     }
 }
 

@@ -132,7 +132,8 @@ impl TurnModel {
 
     /// Conditions the mixture on the state's features.
     pub fn posterior(&self, state: &TurnState) -> Posterior {
-        let mut f = state.features(&state.q);
+        let units = self.model.standardisation();
+        let mut f = units.bent(state.features(&state.q));
         self.model.posterior_of(|k| {
             let absolute = pose::between(&self.charts[k], &state.q);
             f.fixed_rows_mut::<3>(0).copy_from(&absolute);

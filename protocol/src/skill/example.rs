@@ -8,8 +8,8 @@ use super::{
 };
 use crate::pose;
 use crate::predict::{
-    BLOCK, Calibration, FEATURES, Generic, MAX_KNOTS, Model, Regression, Standardisation, TARGETS,
-    TurnModel,
+    BENT, BLOCK, Calibration, FEATURES, Generic, MAX_KNOTS, Model, Regression, Standardisation,
+    TARGETS, TurnModel,
 };
 
 /// A skill of `k` components whose predictor has `knots` knots: valid, repeatable, and learned from nothing.
@@ -144,6 +144,9 @@ pub(super) fn example_model(k: usize, knots: usize) -> Model {
         Standardisation {
             mean: SVector::from_fn(|j, _| 0.1 * j as f64),
             scale: SVector::from_fn(|j, _| 0.05 + 0.01 * (j / 3) as f64),
+            bend: [0.0; BENT],
+            ridge: 0.03,
+            shrinkage: 8.0,
         },
         (0..k).map(component).collect(),
         example_generic(knots),

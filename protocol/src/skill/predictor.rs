@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::SkillError;
 use super::bytes::triangle;
 use crate::predict::{
-    BLOCK, Calibration, FEATURES, Generic, MAX_KNOTS, Model, ModelError, Regression,
+    BENT, BLOCK, Calibration, FEATURES, Generic, MAX_KNOTS, Model, ModelError, Regression,
     Standardisation, TARGETS,
 };
 use crate::wire::codec::DecodeError;
@@ -38,6 +38,9 @@ const EXPONENTS: core::ops::RangeInclusive<i8> = -40..=20;
 pub(super) struct RawModel {
     mean: [f32; FEATURES],
     scale: [f32; FEATURES],
+    bend: [f32; BENT],
+    /// Ridge and shrinkage.
+    training: [f32; 2],
     /// One factor a knot: its length is the number of knots.
     covariance: Vec<f32>,
     /// Of each expert, mixture first.
@@ -109,6 +112,11 @@ impl RawModel {
         Self {
             mean: model.standardisation().mean.map(|v| v as f32).into(),
             scale: model.standardisation().scale.map(|v| v as f32).into(),
+            bend: model.standardisation().bend.map(|v| v as f32),
+            training: [
+                model.standardisation().ridge as f32,
+                model.standardisation().shrinkage as f32,
+            ],
             covariance: calibration.covariance[..knots]
                 .iter()
                 .map(|&v| v as f32)
@@ -176,6 +184,9 @@ impl RawModel {
             Standardisation {
                 mean: SVector::from(self.mean.map(f64::from)),
                 scale: SVector::from(self.scale.map(f64::from)),
+                bend: self.bend.map(f64::from),
+                ridge: f64::from(self.training[0]),
+                shrinkage: f64::from(self.training[1]),
             },
             components,
             generic,

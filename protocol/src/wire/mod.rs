@@ -1,10 +1,12 @@
 //! The wire: one codec, a frozen greeting, framing, and one set of messages per version.
 //! `docs/protocol.md` is the normative text.
 
+pub mod bend;
 pub mod codec;
 pub mod frame;
 pub mod hello;
 pub mod knots;
+pub mod pair;
 mod params;
 pub mod state;
 pub mod turn;

@@ -5,6 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::bend::WireBend;
 use super::codec::{self, DecodeError};
 use super::frame::MAX_FRAME_LEN;
 use super::knots::KnotBlock;
@@ -282,6 +283,9 @@ pub enum OperatorDatagram {
         t_us: i64,
         /// For how long motion is authorised, ms.
         lease_ms: u16,
+        /// What the operator's hand makes of the plan, stated for `t_us`; without it the plan is played as it is, from
+        /// the instant of engaging.
+        bend: Option<WireBend>,
     },
     /// Answer to [`RobotDatagram::Ping`].
     Pong {
@@ -299,6 +303,22 @@ pub enum OperatorDatagram {
         /// The session's epoch.
         epoch: u32,
     },
+    /// What a disciplined clock at the operator says; with every [`OperatorDatagram::Pong`], if it has one.
+    Clock {
+        /// The session's epoch.
+        epoch: u32,
+        /// What it says.
+        clock: ExternalClock,
+    },
+}
+
+/// How the session clock lies to one that is kept right from outside (PTP, chrony).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ExternalClock {
+    /// Time since 1970 on that clock (as `CLOCK_REALTIME` counts it) less the session clock, µs.
+    pub ahead_us: i64,
+    /// How wrong that clock may be, µs.
+    pub dispersion_us: u32,
 }
 
 /// The newest state of the hand, and the knots of its path that are not yet acknowledged.
@@ -542,7 +562,8 @@ impl OperatorDatagram {
                 motion.params.check("motion.params")?;
                 motion.pose.check()
             }
-            Self::Go { .. } | Self::Pong { .. } | Self::Stop { .. } => Ok(()),
+            Self::Go { bend, .. } => bend.as_ref().map_or(Ok(()), WireBend::check),
+            Self::Pong { .. } | Self::Stop { .. } | Self::Clock { .. } => Ok(()),
         }
     }
 }

@@ -2,6 +2,7 @@
 
 use rand::{Rng, RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
+use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::WireParams;
@@ -72,6 +73,23 @@ impl Draw {
                 let first = self.u8();
                 let second = (self.u8()).min(255 - first);
                 [first, second, (255 - first - second) / 2]
+            }),
+        }
+    }
+
+    pub(crate) fn bend(&mut self) -> WireBend {
+        WireBend {
+            plan_us: self.signed(40),
+            rate: self.below(193) as u8,
+            left: std::array::from_fn(|_| self.signed(16) as i32),
+            held: self.maybe(|d| WireHeld {
+                state: d.state(),
+                gain: d.u8(),
+                straight: d.u8(),
+                weight: std::array::from_fn(|i| match i {
+                    0 | 2 | 5 => d.below(128) as i8,
+                    _ => d.signed(6) as i8,
+                }),
             }),
         }
     }

@@ -10,6 +10,7 @@ use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::knots::KnotBlock;
+use telemime_protocol::wire::pair::{AbortCode, Name, PairMessage, commitment};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::WireTurn;
 use telemime_protocol::wire::v1::*;
@@ -143,6 +144,65 @@ fn turns(all: &mut Vec<Vector>) {
             "next": {"after_us": dt_us, "rotation_vector": to, "m": next.memory.each_ref().map(q4)},
         });
         all.push(says("turn", i, codec::encode(&wire), value));
+    }
+}
+
+fn bends(all: &mut Vec<Vector>) {
+    let draw = &mut Draw::new(5);
+    for i in 0..8 {
+        let mut wire = draw.bend();
+        if let Some(held) = &mut wire.held {
+            held.state = moving(i).state;
+        }
+        let bend = wire.dequantise();
+        let at = [(-0.1, 0.0), (0.0, 0.05), (0.2, 0.21), (0.9, 2.0)].map(|(h, k)| {
+            json!({"h_s": h, "k_s": k, "plan_s": bend.plan_at(h), "offset_m": v3(&bend.offset_at(h, k))})
+        });
+        all.push(says("bend", i, codec::encode(&wire), json!({ "at": at })));
+    }
+}
+
+/// Every message of pairing.
+fn pairing(all: &mut Vec<Vector>) {
+    let name = |text| Name::new(text).expect("a name");
+    let (operators, robots) = ([0x11; 32], [0x22; 32]);
+    let hexed = super::hex;
+    let commitment = commitment(&robots);
+    for (title, message, value) in [
+        (
+            "offer",
+            PairMessage::Offer(name("laptop")),
+            json!({"Offer": {"name": "laptop"}}),
+        ),
+        (
+            "commit",
+            PairMessage::Commit(commitment, name("arm-2.left_side")),
+            json!({"Commit": {"commitment": hexed(&commitment), "name": "arm-2.left_side"}}),
+        ),
+        (
+            "nonce",
+            PairMessage::Nonce(operators),
+            json!({"Nonce": {"nonce": hexed(&operators)}}),
+        ),
+        (
+            "reveal",
+            PairMessage::Reveal(robots),
+            json!({"Reveal": {"nonce": hexed(&robots)}}),
+        ),
+        ("confirm", PairMessage::Confirm, json!("Confirm")),
+        ("stored", PairMessage::Stored, json!("Stored")),
+        (
+            "abort",
+            PairMessage::Abort(AbortCode::Other(900), "für später".to_owned()),
+            json!({"Abort": {"code": 900, "text": "für später"}}),
+        ),
+    ] {
+        let bytes = message.encode();
+        assert_eq!(
+            PairMessage::decode(&bytes),
+            Ok(Some((message, bytes.len())))
+        );
+        all.push(says("pairing", title, bytes, value));
     }
 }
 
@@ -298,6 +358,8 @@ pub(crate) fn meanings() -> Vec<Vector> {
         let bytes = OperatorDatagram::Motion(motion).encode();
         all.push(says("constant velocity", i, bytes, value));
     }
+    bends(&mut all);
+    pairing(&mut all);
     paths(&mut all);
     plans(&mut all);
     all

@@ -302,6 +302,17 @@ pub(crate) fn messages() -> Vec<Vector> {
             "stop",
             &OperatorDatagram::Stop { epoch: 7 },
         ),
+        message(
+            OPERATOR_DATAGRAM,
+            "clock",
+            &OperatorDatagram::Clock {
+                epoch: 7,
+                clock: ExternalClock {
+                    ahead_us: 1_792_000_000_000_000,
+                    dispersion_us: 50,
+                },
+            },
+        ),
     ];
     for i in 0..8 {
         let drive = match i % 2 {
@@ -384,6 +395,7 @@ pub(crate) fn messages() -> Vec<Vector> {
             seq: draw.u32(),
             t_us: draw.signed(53),
             lease_ms: draw.u16(),
+            bend: draw.maybe(Draw::bend),
         };
         let pong = OperatorDatagram::Pong {
             epoch: draw.u32(),

@@ -2,9 +2,11 @@
 
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::{Skill, SkillError, example};
+use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::frame::{Deframer, MAX_FRAME_LEN};
 use telemime_protocol::wire::hello::{Answer, Hello, HelloError};
 use telemime_protocol::wire::knots::KnotBlock;
+use telemime_protocol::wire::pair::{PairDecodeError, PairMessage};
 use telemime_protocol::wire::v1::*;
 use telemime_protocol::wire::{DecodeError, codec};
 
@@ -55,6 +57,14 @@ fn reason(kind: &str, bytes: &[u8]) -> &'static str {
         "operator greeting" => {
             return greeting_name(&Hello::decode(bytes).expect_err("no greeting"));
         }
+        "pairing" => {
+            return match PairMessage::decode(bytes).expect_err("no message") {
+                PairDecodeError::Magic => "Magic",
+                PairDecodeError::Kind(_) => "Kind",
+                PairDecodeError::Name => "Name",
+                PairDecodeError::Text => "Text",
+            };
+        }
         "robot greeting" => return greeting_name(&Answer::decode(bytes).expect_err("no greeting")),
         other => panic!("no decoder for {other}"),
     };
@@ -96,6 +106,19 @@ fn greetings(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
         b"TLMM\x03\x02\x00\x02\xff\xfe".to_vec(),
         "Text",
     );
+    for (name, tail, expected) in [
+        ("of a kind nobody knows", &b"\x09"[..], "Kind"),
+        ("with a name of nothing", b"\x01\0", "Name"),
+        ("with a name of other bytes", b"\x01\x03a b", "Name"),
+        (
+            "with a reason that is not UTF-8",
+            b"\x07\x04\0\x02\xff\xfe",
+            "Text",
+        ),
+    ] {
+        say("pairing", name, [b"TLMP", tail].concat(), expected);
+    }
+    say("pairing", "a greeting", hello(1, 1), "Magic");
     let mut huge = (MAX_FRAME_LEN as u32 + 1).to_le_bytes().to_vec();
     say("frame", "one byte too long", huge.clone(), "TooLong");
     huge[3] |= 0x80;
@@ -373,6 +396,59 @@ fn datagrams(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
         OPERATOR_DATAGRAM,
         "weights of more than 1",
         sent(|m| m.params.weights[2] = [200, 50, 6]),
+        "Invalid",
+    );
+    let go = |change: fn(&mut WireBend)| {
+        let mut bend = WireBend {
+            plan_us: 1_500_000,
+            rate: 64,
+            left: [0; 3],
+            held: Some(WireHeld {
+                state: moving(3).state,
+                gain: 255,
+                straight: 128,
+                weight: [64, 10, 100, 0, -5, 127],
+            }),
+        };
+        change(&mut bend);
+        OperatorDatagram::Go {
+            epoch: 7,
+            engagement: 1,
+            seq: 44,
+            t_us: 3_200_000,
+            lease_ms: 650,
+            bend: Some(bend),
+        }
+        .encode()
+    };
+    say(
+        OPERATOR_DATAGRAM,
+        "a plan's rate above 1.5",
+        go(|b| b.rate = 193),
+        "Invalid",
+    );
+    say(
+        OPERATOR_DATAGRAM,
+        "a plan at no time of a session",
+        go(|b| b.plan_us = i64::MIN),
+        "Invalid",
+    );
+    say(
+        OPERATOR_DATAGRAM,
+        "a displacement beyond 100 m",
+        go(|b| b.left[1] = 1_000_001),
+        "Invalid",
+    );
+    say(
+        OPERATOR_DATAGRAM,
+        "a weight below 0",
+        go(|b| b.held.as_mut().expect("it holds on").weight[2] = -1),
+        "Invalid",
+    );
+    say(
+        OPERATOR_DATAGRAM,
+        "a weight beside the diagonal above a half",
+        go(|b| b.held.as_mut().expect("it holds on").weight[3] = 65),
         "Invalid",
     );
     // The last three bytes: no gripper, knot 0, no knots.

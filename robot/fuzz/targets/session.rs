@@ -294,6 +294,7 @@ impl Bench {
                     seq: self.seq,
                     t_us: self.session_us(input.byte()),
                     lease_ms: 650,
+                    bend: None,
                 };
                 self.datagram(&go.encode());
             }

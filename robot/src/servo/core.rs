@@ -7,7 +7,7 @@ use telemime_protocol::wire::v1::Cause;
 use telemime_sim::arm::{Gripper, Plant, PlantReport};
 
 use super::mapping::{Mapping, Workspace};
-use super::orders::{Engagement, Order, Report, Rings, Source, Ticket, Trajectory};
+use super::orders::{Bent, Engagement, Order, Report, Rings, Source, Ticket, Trajectory};
 use crate::control::{Clamps, Controller, Demand};
 use crate::safety::{Safety, SafetyConfig};
 
@@ -58,7 +58,10 @@ enum Drive {
         turn: Option<(TurnForecast, Mono)>,
         grip: Option<f64>,
     },
-    Play(Box<Trajectory>),
+    Play {
+        trajectory: Box<Trajectory>,
+        bent: Option<Bent>,
+    },
 }
 
 /// The servo's state.
@@ -213,8 +216,15 @@ impl Core {
                     self.safety.news(lease);
                 }
             }
-            Order::Extend { ticket, lease } => {
-                if matches!(self.drive, Drive::Play(_)) && ticket == self.engagement {
+            Order::Extend {
+                ticket,
+                lease,
+                bent,
+            } => {
+                if let Drive::Play { bent: held, .. } = &mut self.drive
+                    && ticket == self.engagement
+                {
+                    *held = bent.or(*held);
                     self.safety.news(lease);
                 }
             }
@@ -240,7 +250,10 @@ impl Core {
                 turn: turn.map(|turn| (turn, valid_at)),
                 grip,
             },
-            Source::Play(trajectory) => Drive::Play(trajectory),
+            Source::Play(trajectory) => Drive::Play {
+                trajectory,
+                bent: None,
+            },
         };
         // An orientation that is none would be the reference for all that follows.
         let hand_orientation = match &drive {
@@ -248,7 +261,7 @@ impl Core {
                 let q = turn.at(now.secs_since(valid_at)).orientation;
                 q.coords.iter().all(|v| v.is_finite()).then_some(q)
             }),
-            Drive::Play(trajectory) => trajectory
+            Drive::Play { trajectory, .. } => trajectory
                 .curve
                 .orientation
                 .is_some()
@@ -267,7 +280,7 @@ impl Core {
             Drive::Mirror {
                 forecast, valid_at, ..
             } => forecast.at(now.secs_since(*valid_at)).position,
-            Drive::Play(trajectory) => trajectory.curve.position_at(0.0),
+            Drive::Play { trajectory, .. } => trajectory.curve.position_at(0.0),
             Drive::Nothing => Vector3::zeros(),
         };
         let old = std::mem::replace(&mut self.drive, drive);
@@ -288,7 +301,7 @@ impl Core {
     }
 
     fn discard(&mut self, drive: Drive) {
-        if let Drive::Play(trajectory) = drive {
+        if let Drive::Play { trajectory, .. } = drive {
             // Only a session that never frees anything fills this ring; then the plan is leaked, not freed here.
             if let Err(rtrb::PushError::Full(trajectory)) = self.rings.spent.push(trajectory) {
                 std::mem::forget(trajectory);
@@ -321,15 +334,21 @@ impl Core {
                     ramp(since_s / RAMP_S),
                 )
             }
-            Drive::Play(trajectory) => {
-                if since_s > trajectory.duration_s + SETTLE_S {
+            Drive::Play { trajectory, bent } => {
+                let plan_s = bent.map_or(since_s, |bent| bent.plan_s(now));
+                let over = bent.is_none_or(|bent| bent.is_over(now));
+                if over && plan_s > trajectory.duration_s + SETTLE_S {
                     self.safety.release(Cause::PlanFinished);
                     return Demand::Stop;
                 }
-                let t_s = (since_s + self.config.lag_s).min(trajectory.duration_s);
+                let ahead = now.offset_by_secs(self.config.lag_s);
+                let (t_s, offset) = match bent {
+                    Some(bent) => (bent.plan_s(ahead), bent.offset(ahead)),
+                    None => (since_s + self.config.lag_s, Vector3::zeros()),
+                };
                 let curve = &trajectory.curve;
                 (
-                    curve.position_at(t_s),
+                    curve.position_at(t_s) + offset,
                     curve
                         .orientation
                         .is_some()
@@ -362,7 +381,16 @@ impl Core {
     fn report(&self, now: Mono) -> Report {
         let age_s = match &self.drive {
             Drive::Mirror { valid_at, .. } => now.secs_since(*valid_at),
-            Drive::Play(_) | Drive::Nothing => 0.0,
+            Drive::Play {
+                bent: Some(bent), ..
+            } if bent.bend.held.is_some() => now.secs_since(bent.sampled_at),
+            Drive::Play { .. } | Drive::Nothing => 0.0,
+        };
+        let plan_s = match &self.drive {
+            Drive::Play { bent, .. } if self.safety.is_following() => {
+                Some(bent.map_or_else(|| now.secs_since(self.engaged_at), |bent| bent.plan_s(now)))
+            }
+            _ => None,
         };
         Report {
             tick: self.tick,
@@ -376,6 +404,7 @@ impl Core {
             mapping: self.mapping,
             moving: self.moving,
             age_s,
+            plan_s,
             target_m: self.target_m,
             reference_m: self.reference_m,
             jerk_m_s3: self.jerk_m_s3,

@@ -14,6 +14,6 @@ pub use self::core::{Core, CoreConfig, RAMP_S, ramp};
 pub use brake::Brake;
 pub use mapping::{Mapping, Workspace};
 pub use orders::{
-    Engagement, Handle, Lease, Order, Report, Rings, Source, Ticket, Trajectory, rings,
+    Bent, Engagement, Handle, Lease, Order, Report, Rings, Source, Ticket, Trajectory, rings,
 };
 pub use stats::TickStats;

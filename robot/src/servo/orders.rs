@@ -3,7 +3,7 @@
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
 use telemime_protocol::checkpoint::PoseCurve;
-use telemime_protocol::predict::{Forecast, TurnForecast};
+use telemime_protocol::predict::{Bend, Forecast, TurnForecast};
 use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_sim::arm::Joints;
 
@@ -39,6 +39,35 @@ pub enum Source {
     },
     /// A plan, from its beginning.
     Play(Box<Trajectory>),
+}
+
+/// What the operator's hand makes of a plan, on the robot's clock.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Bent {
+    /// When of the plan it is, and how far beside it.
+    pub bend: Bend,
+    /// The moment that is stated for.
+    pub at: Mono,
+    /// When the hand's newest sample was valid, while it holds on.
+    pub sampled_at: Mono,
+}
+
+impl Bent {
+    /// The plan's time at `now`, s.
+    pub fn plan_s(&self, now: Mono) -> f64 {
+        self.bend.plan_at(now.secs_since(self.at))
+    }
+
+    /// How far beside the plan the hand belongs at `now`, m.
+    pub fn offset(&self, now: Mono) -> Vector3<f64> {
+        self.bend
+            .offset_at(now.secs_since(self.at), now.secs_since(self.sampled_at))
+    }
+
+    /// Whether nothing bends the plan any more at `now`.
+    pub fn is_over(&self, now: Mono) -> bool {
+        self.bend.is_over(now.secs_since(self.at))
+    }
 }
 
 /// Which engagement of which session.
@@ -103,6 +132,8 @@ pub enum Order {
         ticket: Ticket,
         /// For how long.
         lease: Lease,
+        /// What the operator's hand makes of the plan; without news of it the last one goes on.
+        bent: Option<Bent>,
     },
     /// The clutch is let go.
     Release(Ticket),
@@ -140,6 +171,8 @@ pub struct Report {
     pub moving: bool,
     /// Age of the newest hand state, s.
     pub age_s: f64,
+    /// The plan's time while one is played, s; it has reached the tip when the tip's lag is over.
+    pub plan_s: Option<f64>,
     /// Where the tip is asked to go, m.
     pub target_m: Vector3<f64>,
     /// Where the filter has it, m.

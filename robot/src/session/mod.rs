@@ -19,8 +19,8 @@ use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::turn::{WireRotation, dequantise_grip, quantise_grip};
 use telemime_protocol::wire::v1::{
-    Cause, Drive, Engage, Info, MAX_PLAN_LEN, Message, ModelId, OperatorControl, OperatorDatagram,
-    Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
+    Cause, Drive, Engage, ExternalClock, Info, MAX_PLAN_LEN, Message, ModelId, OperatorControl,
+    OperatorDatagram, Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
 };
 use telemime_protocol::wire::{DecodeError, Version, Versions};
 
@@ -101,6 +101,7 @@ pub struct Session {
     epoch: u32,
     version: Version,
     clock: SessionClock,
+    external: Option<ExternalClock>,
     skill: Option<Arc<Skill>>,
     /// Takes its place at the next engage.
     next_skill: Option<Arc<Skill>>,
@@ -136,6 +137,7 @@ impl Session {
             epoch,
             version: Version::V1,
             clock: SessionClock::default(),
+            external: None,
             skill,
             next_skill: None,
             plan: None,
@@ -170,6 +172,11 @@ impl Session {
     /// The model held, for the next session.
     pub fn skill(&self) -> Option<Arc<Skill>> {
         self.next_skill.as_ref().or(self.skill.as_ref()).cloned()
+    }
+
+    /// What the robot's own disciplined clock says now, relative to its monotonic one, if it has one.
+    pub fn set_external(&mut self, external: Option<ExternalClock>) {
+        self.external = external;
     }
 
     /// The clock estimate.
@@ -242,7 +249,11 @@ impl Session {
                 seq,
                 t_us,
                 lease_ms,
-            }) => self.on_go(now, epoch, engagement, seq, t_us, lease_ms),
+                bend,
+            }) => {
+                let ours = epoch == self.epoch && engagement == self.engagement;
+                ours && self.on_go(now, seq, t_us, lease_ms, bend.as_ref())
+            }
             Ok(OperatorDatagram::Pong {
                 epoch,
                 t1_us,
@@ -259,11 +270,29 @@ impl Session {
                 self.follow_clock(now);
                 true
             }
+            Ok(OperatorDatagram::Clock {
+                epoch,
+                clock: theirs,
+            }) if epoch == self.epoch => {
+                if let Some(ours) = self.external {
+                    let ahead_us = ours.ahead_us.saturating_sub(theirs.ahead_us);
+                    let bound_us = f64::from(ours.dispersion_us) + f64::from(theirs.dispersion_us);
+                    let offset_ns = ahead_us.saturating_mul(1000);
+                    self.clock.observe_outside(now, offset_ns, bound_us * 1e-6);
+                    self.follow_clock(now);
+                }
+                true
+            }
             Ok(OperatorDatagram::Stop { epoch }) if epoch == self.epoch => {
                 self.brake(Cause::OperatorStop);
                 true
             }
-            Ok(OperatorDatagram::Pong { .. } | OperatorDatagram::Stop { .. }) | Err(_) => false,
+            Ok(
+                OperatorDatagram::Pong { .. }
+                | OperatorDatagram::Stop { .. }
+                | OperatorDatagram::Clock { .. },
+            )
+            | Err(_) => false,
         };
         if !taken {
             self.counters.dropped += 1;

@@ -4,16 +4,20 @@ use telemime_endpoint::Mono;
 use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid};
 use telemime_protocol::predict::{Forecast, HandState, Params, TurnForecast, checksum};
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::bend::WireBend;
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WireTurn, dequantise_grip};
 use telemime_protocol::wire::v1::{MAX_TAIL_KNOTS, Motion, PathTail, Refusal, model_tag};
 
 use super::Session;
-use crate::servo::{Lease, Order};
+use crate::servo::{Bent, Lease, Order};
 
 /// Knots of the path kept: minutes of motion, a fixed amount of memory.
 const PATH_KNOTS: usize = 8192;
+
+/// A message that cannot be meant.
+struct Impossible;
 
 /// A mirror engagement: the path received so far.
 #[derive(Debug)]
@@ -84,20 +88,16 @@ impl Session {
         true
     }
 
-    /// A go; says whether it was of use.
+    /// A go of this engagement; says whether it was of use.
     pub(super) fn on_go(
         &mut self,
         now: Mono,
-        epoch: u32,
-        engagement: u32,
         seq: u32,
         t_us: i64,
         lease_ms: u16,
+        bend: Option<&WireBend>,
     ) -> bool {
-        if epoch != self.epoch || engagement != self.engagement || self.mirror.is_some() {
-            return false;
-        }
-        if seq <= self.newest_seq {
+        if self.mirror.is_some() || seq <= self.newest_seq {
             return false;
         }
         let Some(sent_at) = self.clock.to_mono(Stamp(t_us.saturating_mul(1000))) else {
@@ -111,12 +111,38 @@ impl Session {
         if lease.until <= now {
             return false;
         }
+        let Ok(bent) = bend.map(|bend| self.bent(sent_at, bend)).transpose() else {
+            return false;
+        };
         self.newest_seq = seq;
         self.counters.received += 1;
         self.delay_s = age_s;
         let ticket = self.ticket();
-        self.order(Order::Extend { ticket, lease });
+        self.order(Order::Extend {
+            ticket,
+            lease,
+            bent,
+        });
         true
+    }
+
+    /// A bend on the robot's clock; a hand's sample from the future is none.
+    fn bent(&self, at: Mono, bend: &WireBend) -> Result<Bent, Impossible> {
+        let sampled_at = match &bend.held {
+            Some(held) => {
+                let t = Stamp(held.state.t_us.saturating_mul(1000));
+                self.clock.to_mono(t).ok_or(Impossible)?
+            }
+            None => at,
+        };
+        if sampled_at.secs_since(at) > self.config.max_delay_s {
+            return Err(Impossible);
+        }
+        Ok(Bent {
+            bend: bend.dequantise(),
+            at,
+            sampled_at,
+        })
     }
 
     /// Counted from the arrival, or from when the message should have arrived at the latest.

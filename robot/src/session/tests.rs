@@ -79,6 +79,7 @@ fn report(state: RobotState) -> Report {
         tip_m,
         orientation: UnitQuaternion::identity(),
         orientation_error_rad: 0.0,
+        plan_s: None,
         opening: 1.0,
         q: Joints::zeros(),
         clamps: 0,

@@ -10,6 +10,9 @@ const REACH_STREAM: u64 = 0x007e_3ac4;
 /// How long the hand rests before and after, s.
 const REST_S: f64 = 0.2;
 
+/// How long it moves, on average, s.
+const REACH_S: f64 = 1.5;
+
 /// One reach for `goal` (m): (time s, position m), about 30 Hz, 1.5 to 2.5 s long, starting and ending at rest.
 ///
 /// Axes are a Kinect's: x to the side, y up, z away from the sensor. The same `seed` is the same person at the same table; `index` counts
@@ -23,13 +26,23 @@ const REST_S: f64 = 0.2;
 /// assert!(reach.last().is_some_and(|&(_, x)| (x[0] - goal[0]).abs() < 0.02));
 /// ```
 pub fn reach(seed: u64, index: u32, goal: [f64; 3]) -> Vec<(f64, [f64; 3])> {
+    carry(seed, index, goal, REACH_S)
+}
+
+/// [`reach`] by a hand that takes its time, as one that carries something: about `moving_s` instead of 1.5 s.
+///
+/// ```
+/// let carried = telemime_sim::hand::carry(7, 0, [0.3, -0.1, 2.1], 4.0);
+/// assert!((3.0..6.0).contains(&carried[carried.len() - 1].0));
+/// ```
+pub fn carry(seed: u64, index: u32, goal: [f64; 3], moving_s: f64) -> Vec<(f64, [f64; 3])> {
     let mut person = stream(seed ^ REACH_STREAM, 0);
     let rest: [f64; 3] =
         [-0.1, -0.25, 2.4].map(|centre| centre + 0.05 * normal(&mut person).clamp(-2.0, 2.0));
     let mut rng = stream(seed ^ REACH_STREAM, u64::from(index) + 1);
     let start: [f64; 3] =
         core::array::from_fn(|i| rest[i] + 0.05 * normal(&mut rng).clamp(-2.0, 2.0));
-    let moving_s = 1.5 * (1.0 + 0.08 * normal(&mut rng)).clamp(0.8, 1.3);
+    let moving_s = moving_s * (1.0 + 0.08 * normal(&mut rng)).clamp(0.8, 1.3);
     let lift_m = 0.14 * (1.0 + 0.08 * normal(&mut rng)).clamp(0.7, 1.3);
     let back_m = 0.06 * (1.0 + 0.08 * normal(&mut rng)).clamp(0.7, 1.3);
     let frames = ((moving_s + 2.0 * REST_S) / FRAME_S).ceil() as u32;

@@ -1,7 +1,7 @@
 """Every message of version 1 (§4, §5), field by field."""
 
 from . import path
-from .codec import (F32, I64, U8, U16, U32, Array, Bytes, Enum, Option, Struct, Text, Vec, WireError, decode, encode, finite, require)
+from .codec import (F32, I8, I32, I64, U8, U16, U32, Array, Bytes, Enum, Option, Struct, Text, Vec, WireError, decode, encode, finite, require)
 from .frames import LONGEST
 from .state import PARAMS, POSE, ROTATION, STATE, _rotation_range
 
@@ -62,6 +62,20 @@ def _telemetry(m):
     _rotation_range("tip_q")(m)
 
 
+def _bend(b):
+    require(abs(b["plan_us"]) <= (2**63 - 1) // 1000, "plan_us", b["plan_us"])
+    require(b["rate"] <= 192, "rate", b["rate"])
+    require(all(abs(n) <= 1_000_000 for n in b["left"]), "left", b["left"])
+
+
+def _held(h):
+    for i, n in enumerate(h["weight"]):
+        low, high = (0, 127) if i in (0, 2, 5) else (-64, 64)
+        require(low <= n <= high, "weight", h["weight"])
+
+
+HELD = Struct(("state", STATE), ("gain", U8), ("straight", U8), ("weight", Array(I8, 6)), check=_held)
+BEND = Struct(("plan_us", I64), ("rate", U8), ("left", Array(I32, 3)), ("held", Option(HELD)), check=_bend)
 DRIVE = Enum(
     ("Mirror", Struct(("state", STATE), ("model", U16), ("params", PARAMS), ("pose", POSE))),
     ("Play", Struct(("plan", U32))),
@@ -94,9 +108,11 @@ OPERATOR_DATAGRAM = Enum(
     ("Motion", Struct(
         ("epoch", U32), ("engagement", U32), ("seq", U32), ("lease_ms", U16), ("model", U16), ("params", PARAMS),
         ("checksum", Option(U32)), ("state", STATE), ("pose", POSE), ("first_knot", U32), ("knots", Knots(32)))),
-    ("Go", Struct(("epoch", U32), ("engagement", U32), ("seq", U32), ("t_us", I64), ("lease_ms", U16))),
+    ("Go", Struct(
+        ("epoch", U32), ("engagement", U32), ("seq", U32), ("t_us", I64), ("lease_ms", U16), ("bend", Option(BEND)))),
     ("Pong", Struct(("epoch", U32), ("t1_us", I64), ("t2_us", I64), ("t3_us", I64))),
     ("Stop", Struct(("epoch", U32))),
+    ("Clock", Struct(("epoch", U32), ("clock", Struct(("ahead_us", I64), ("dispersion_us", U32))))),
 )  # fmt: skip
 ROBOT_DATAGRAM = Enum(
     ("Ping", Struct(("epoch", U32), ("t1_us", I64))),

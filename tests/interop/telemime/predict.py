@@ -67,7 +67,7 @@ class Model:
         apart, novelty, logs = [], math.inf, []
         for k, c in enumerate(self.components):
             f = features[k] if self.charts else features
-            e = [(a - m) / s - mu for a, m, s, mu in zip(f, self.p["mean"], self.p["scale"], c["mean"])]
+            e = [(a - m) / s - mu for a, m, s, mu in zip(self.bent(f), self.p["mean"], self.p["scale"], c["mean"])]
             z = []
             for row, value in zip(c["low"], e):
                 z.append((value - sum(a * b for a, b in zip(row, z))) / row[-1])
@@ -82,6 +82,16 @@ class Model:
         r = [a if a >= 1e-12 else 0.0 for a in r]
         total = sum(r)
         return [a / total for a in r], apart, novelty
+
+    def bent(self, features):
+        """The features with the differences to the two quickest memories bent."""
+        out = list(features)
+        for i, b in enumerate(self.p["bend"]):
+            u = features[3 + 3 * i : 6 + 3 * i]
+            length = math.sqrt(norm2(u))
+            if b > 0 and length > 0:
+                out[3 + 3 * i : 6 + 3 * i] = [c * (b * math.log(1 + length / b) / length) for c in u]
+        return out
 
     def familiarity(self, novelty):
         """F: how much of the mixture's weight is left."""

@@ -65,11 +65,12 @@ COMPONENT = Struct(
 
 def _predictor(p):
     j = len(p["covariance"])
-    finite("predictor", *(p[k] for k in ("mean", "scale", "covariance", "errors", "novelty90", "lead", "products")))
+    finite("predictor", *(p[k] for k in ("mean", "scale", "bend", "training", "covariance", "errors", "novelty90", "lead", "products")))
     for name in ("scale", "covariance"):
         require(all(v > 0 for v in p[name]), name, p[name])
     require(all(v > 0 for row in p["errors"] for v in row), "errors", p["errors"])
     require(all(p["products"][i * (i + 3) // 2] > 0 for i in range(4)), "products", p["products"])
+    require(all(v >= 0 for v in p["bend"] + p["training"]), "bend, training", p["bend"] + p["training"])
     require(p["novelty90"] > 0, "novelty90", p["novelty90"])
     require(all(len(p[name]) == j for name in ("errors", "lead", "exponents")), "lengths", j)
     require(all(-40 <= e <= 20 for e in p["exponents"]), "exponents", p["exponents"])
@@ -84,7 +85,8 @@ def _predictor(p):
 
 
 PREDICTOR = Struct(
-    ("mean", Array(F32, FEATURES)), ("scale", Array(F32, FEATURES)), ("covariance", Vec(F32, KNOTS, 1)),
+    ("mean", Array(F32, FEATURES)), ("scale", Array(F32, FEATURES)), ("bend", Array(F32, 2)), ("training", Array(F32, 2)),
+    ("covariance", Vec(F32, KNOTS, 1)),
     ("errors", Vec(Array(F32, 4), KNOTS, 1)), ("novelty90", F32), ("lead", Vec(Array(F32, 4), KNOTS, 1)),
     ("products", Array(F32, 10)), ("exponents", Vec(I8, KNOTS, 1)),
     ("components", Vec(COMPONENT, COMPONENTS, 1)), check=_predictor)  # fmt: skip

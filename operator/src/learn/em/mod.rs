@@ -308,15 +308,16 @@ pub fn from_start<const D: usize>(
     em.finish(&units, Start::Given, options)
 }
 
-/// EM as the predictor uses it: from labels, in the units of the rows; returns the responsibilities of
-/// the last E step, row by row, and the number of components.
+/// EM as the predictor uses it: from labels, in the units of the rows, each of which counts `weights` times;
+/// returns the responsibilities of the last E step, row by row, and the number of components.
 pub(super) fn responsibilities<const D: usize>(
     data: &[SVector<f64, D>],
+    weights: &[f64],
     labels: &[usize],
     options: &EmOptions,
 ) -> Result<(Vec<f64>, usize), LearnError> {
     check(data, options.components)?;
-    let tiles = Tiles::new(data);
+    let tiles = Tiles::weighted(data, weights);
     let mut em = Em::from_labels(data, &tiles, labels, options)?;
     em.run(options);
     let seen = em.seen();

@@ -30,6 +30,8 @@ type Lanes = [f64; LANES];
 pub(in crate::learn) struct Tiles<const D: usize> {
     tiles: Vec<[Lanes; D]>,
     rows: usize,
+    /// Of each lane, if rows do not all count alike.
+    weights: Vec<Lanes>,
 }
 
 impl<const D: usize> Tiles<D> {
@@ -44,7 +46,23 @@ impl<const D: usize> Tiles<D> {
         Self {
             tiles,
             rows: rows.len(),
+            weights: Vec::new(),
         }
+    }
+
+    /// Rows that count as often as their weights say.
+    pub(in crate::learn) fn weighted(rows: &[SVector<f64, D>], weights: &[f64]) -> Self {
+        let lanes = |chunk: &[f64]| std::array::from_fn(|l| chunk.get(l).copied().unwrap_or(0.0));
+        Self {
+            weights: weights.chunks(LANES).map(lanes).collect(),
+            ..Self::new(rows)
+        }
+    }
+
+    /// How often a row counts.
+    pub(in crate::learn) fn weight(&self, row: usize) -> f64 {
+        let lanes = self.weights.get(row / LANES);
+        lanes.map_or(1.0, |lanes| lanes[row % LANES])
     }
 
     /// Rows of data, without the filling.
@@ -211,7 +229,14 @@ pub(in crate::learn) fn pass<const D: usize>(
     let fill = tiles.tiles.len() * LANES - tiles.rows;
     let of = |(index, chunk): (usize, &[[Lanes; D]])| {
         let last = (index + 1) * CHUNK >= tiles.tiles.len();
-        chunk_pass(chunk, if last { fill } else { 0 }, kernels, &references)
+        let weights = tiles.weights.get(index * CHUNK..).unwrap_or(&[]);
+        chunk_pass(
+            chunk,
+            weights,
+            if last { fill } else { 0 },
+            kernels,
+            &references,
+        )
     };
     let zero = Pass {
         log_likelihood: 0.0,
@@ -238,6 +263,7 @@ pub(in crate::learn) fn pass<const D: usize>(
 
 fn chunk_pass<const D: usize>(
     tiles: &[[Lanes; D]],
+    weights: &[Lanes],
     fill: usize,
     kernels: &[Kernel<D>],
     references: &[[f64; D]],
@@ -257,7 +283,8 @@ fn chunk_pass<const D: usize>(
         for (t, concerned) in concerned.iter_mut().enumerate().take(block.len()) {
             let is_last = index * BLOCK + t + 1 == tiles.len();
             let counted = LANES - if is_last { fill } else { 0 };
-            log_likelihood += normalise(&mut shares, t, counted, concerned);
+            let weights = weights.get(index * BLOCK + t);
+            log_likelihood += normalise(&mut shares, t, counted, weights, concerned);
         }
         for (c, (sum, shares)) in sums.iter_mut().zip(&shares).enumerate() {
             for ((x, r), concerned) in block.iter().zip(shares).zip(&concerned) {
@@ -275,7 +302,13 @@ fn chunk_pass<const D: usize>(
 
 /// Log densities to responsibilities, of one tile; returns its log likelihood.
 #[inline]
-fn normalise(shares: &mut [[Lanes; BLOCK]], t: usize, counted: usize, concerned: &mut u64) -> f64 {
+fn normalise(
+    shares: &mut [[Lanes; BLOCK]],
+    t: usize,
+    counted: usize,
+    weights: Option<&Lanes>,
+    concerned: &mut u64,
+) -> f64 {
     const { assert!(MAX_COMPONENTS <= 64, "a component is a bit of `concerned`") };
     let mut max = [FLOOR; LANES];
     for l in shares.iter() {
@@ -304,12 +337,19 @@ fn normalise(shares: &mut [[Lanes; BLOCK]], t: usize, counted: usize, concerned:
         // Every sum holds the exponential of zero, so it is at least one.
         *scale = if l < counted { 1.0 / sum } else { 0.0 };
     }
+    if let Some(weights) = weights {
+        scale.iter_mut().zip(weights).for_each(|(s, w)| *s *= w);
+    }
     for (c, l) in shares.iter_mut().enumerate() {
         if *concerned >> c & 1 == 1 {
             for (v, s) in l[t].iter_mut().zip(&scale) {
                 *v *= s;
             }
         }
+    }
+    if let Some(weights) = weights {
+        let each = max.iter().zip(&sum).zip(weights).take(counted);
+        return each.map(|((m, s), w)| w * (m + s.ln())).sum();
     }
     // Eight sums of at most 64 multiply to 2⁴⁸: one logarithm does for all.
     let product: f64 = sum[..counted].iter().product();
@@ -412,6 +452,34 @@ mod tests {
                 assert!(near(got.sums[k].first.x, sums[3 * k + 1]), "{n}");
                 assert!(near(got.sums[k].second[(1, 0)], sums[3 * k + 2]), "{n}");
             }
+        }
+    }
+
+    /// A row of weight two is two rows, one of weight nothing none.
+    #[test]
+    fn a_weight_is_how_often_a_row_counts() {
+        let gmm = Gmm::<1>::new([
+            (0.5, SVector::from([0.0]), SMatrix::from([[1.0]])),
+            (0.5, SVector::from([2.0]), SMatrix::from([[0.5]])),
+        ])
+        .unwrap();
+        let rows: Vec<SVector<f64, 1>> = (0..13)
+            .map(|i| SVector::from([0.3 * f64::from(i)]))
+            .collect();
+        let weights: Vec<f64> = (0..13).map(|i| f64::from(i % 3)).collect();
+        let repeated: Vec<SVector<f64, 1>> = rows
+            .iter()
+            .zip(&weights)
+            .flat_map(|(x, w)| std::iter::repeat_n(*x, *w as usize))
+            .collect();
+        let kernels = Kernel::of(&gmm);
+        let weighted = pass(&Tiles::weighted(&rows, &weights), &kernels, None);
+        let plain = pass(&Tiles::new(&repeated), &kernels, None);
+        assert!((weighted.log_likelihood - plain.log_likelihood).abs() < 1e-12);
+        for (a, b) in weighted.sums.iter().zip(&plain.sums) {
+            assert!((a.n - b.n).abs() < 1e-12);
+            assert!((a.first - b.first).norm() < 1e-12);
+            assert!((a.second - b.second).norm() < 1e-12);
         }
     }
 

@@ -166,7 +166,7 @@ impl<'a, const D: usize> Em<'a, D> {
             .expect("the standard normal is a mixture");
         let mut em = Self::new(data, tiles, one);
         em.reseeded = vec![false; k];
-        let moments = of_labels(data, labels, k);
+        let moments = of_labels(data, |row| tiles.weight(row), labels, k);
         // Distance from the common mean stands in for the density that no E step has found yet.
         let mean = data.iter().sum::<SVector<f64, D>>() / data.len() as f64;
         let densities = || data.iter().map(|x| -(x - mean).norm_squared()).collect();
@@ -315,9 +315,11 @@ fn take_worst(densities: &mut [f64]) -> usize {
     worst
 }
 
-/// Moments of groups of rows, centred on the groups' own means. A label of K or more means K − 1.
+/// Moments of groups of rows, each counted as its weight says, centred on the groups' own means. A label of K or
+/// more means K − 1.
 pub(in crate::learn) fn of_labels<const D: usize>(
     data: &[SVector<f64, D>],
+    weight: impl Fn(usize) -> f64,
     labels: &[usize],
     k: usize,
 ) -> Vec<Moments<D>> {
@@ -328,18 +330,19 @@ pub(in crate::learn) fn of_labels<const D: usize>(
     };
     let mut groups = vec![zero; k];
     let group = |&label: &usize| label.min(k - 1);
-    for (x, label) in data.iter().zip(labels) {
+    for (row, (x, label)) in data.iter().zip(labels).enumerate() {
         let g = &mut groups[group(label)];
-        g.n += 1.0;
-        g.mean += x;
+        let w = weight(row);
+        g.n += w;
+        g.mean += x * w;
     }
     for g in &mut groups {
         g.mean /= g.n.max(f64::MIN_POSITIVE);
     }
-    for (x, label) in data.iter().zip(labels) {
+    for (row, (x, label)) in data.iter().zip(labels).enumerate() {
         let g = &mut groups[group(label)];
         let e = x - g.mean;
-        add_outer(&mut g.scatter, &e, 1.0);
+        add_outer(&mut g.scatter, &e, weight(row));
     }
     for g in &mut groups {
         mirror(&mut g.scatter);

@@ -28,14 +28,15 @@ impl Products {
             targets: SMatrix::zeros(),
         };
         for row in rows {
-            out.n += 1.0;
+            out.n += row.weight;
             let way = |i: usize| row.features.fixed_rows::<3>(3 * (i + 1));
             for a in 0..4 {
                 for b in 0..4 {
-                    out.ways[(a, b)] += way(a).dot(&way(b));
+                    out.ways[(a, b)] += row.weight * way(a).dot(&way(b));
                 }
                 for (j, y) in row.targets.chunks_exact(3).enumerate() {
-                    out.targets[(a, j)] += way(a).dot(&Vector3::from_column_slice(y));
+                    let along = way(a).dot(&Vector3::from_column_slice(y));
+                    out.targets[(a, j)] += row.weight * along;
                 }
             }
         }
@@ -108,6 +109,7 @@ mod tests {
                     features: SVector::from_fn(|j, _| (u * (1.0 + 0.37 * j as f64)).sin() * 0.1),
                     targets: [0.0; 3 * MAX_KNOTS],
                     orientation: Default::default(),
+                    weight: 1.0,
                 };
                 let about = nalgebra::Rotation3::from_euler_angles(turn, 0.4 * turn, 0.0);
                 for a in 0..5 {

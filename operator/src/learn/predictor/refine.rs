@@ -5,8 +5,9 @@ use telemime_protocol::predict::{Calibration, FEATURES, MAX_KNOTS, Regression, T
 
 use super::blocks::{self, Blocks};
 use super::generic::Products;
+use super::rows::{Scaling, with_copies};
 use super::{
-    Course, EM_KNOTS, Fitted, PredictorOptions, Row, Scaling, em_options, rows_of, scale_row,
+    Character, Course, EM_KNOTS, Fitted, PredictorOptions, Row, assign, em_options, queried,
 };
 use crate::demonstration::Demonstration;
 use crate::learn::LearnError;
@@ -21,8 +22,8 @@ const MOST_CHANGE: f64 = 4.0;
 /// A refined predictor.
 pub(in crate::learn) struct Refined<M> {
     pub(in crate::learn) model: M,
-    /// Rows it has learned from the new demonstration.
-    pub(in crate::learn) rows: usize,
+    /// Rows that the new demonstration counts for.
+    pub(in crate::learn) rows: f64,
     /// Share of the new demonstration's samples that were newer to the old model than 90 % of those held out before.
     pub(in crate::learn) novel: f64,
 }
@@ -38,33 +39,40 @@ pub(in crate::learn) fn refine<C: Course>(
     demonstrations: usize,
     d: &Demonstration,
 ) -> Result<Refined<C::Model>, LearnError> {
-    let options = em_options(&PredictorOptions::default());
     let (inner, charts) = C::parts(model);
     let features = inner.standardisation().clone();
+    let options = em_options(&Character {
+        bend: 0.0,
+        shrinkage: features.shrinkage,
+        ridge: features.ridge,
+    });
     let scaling = Scaling {
         features: features.clone(),
         target_mean: [0.0; TARGETS],
         target_scale: [1.0; TARGETS],
     };
-    let taken = rows_of::<C>(d, inner.knots(), &UnitQuaternion::identity());
+    let copies = PredictorOptions::default().copies;
+    let taken = with_copies::<C>(d, inner.knots(), &UnitQuaternion::identity(), copies);
     let mut products = Products::recovered(inner.generic(), rows);
     products.join(&Products::of(taken.iter()));
-    let new: Vec<Row> = taken.iter().map(|row| scale_row(row, &scaling)).collect();
+    let new: Vec<Row> = taken.iter().map(|row| scaling.row(row)).collect();
     let seen = |k: usize| C::seen(&new, charts.get(k), features.scale[0]);
     let old = blocks::recovered(inner.components(), rows, &options);
     let knots = EM_KNOTS.map(|knot| knot.min(inner.knots()) - 1);
     let floor = knots.map(|knot| options.ridge * variance(&old, knot));
     let mut components = inner.components().to_vec();
-    for _ in 0..STEPS {
-        let stride = components.len();
-        let mut shares = vec![0.0; new.len() * stride];
-        for (k, c) in components.iter().enumerate() {
-            let to = shares.iter_mut().skip(k).step_by(stride);
-            for (share, row) in to.zip(seen(k).iter()) {
-                *share = log_density(c, row, &knots, &floor);
-            }
+    for step in 0..=STEPS {
+        let mut shares = vec![0.0; new.len() * components.len()];
+        if step < STEPS {
+            let joint = |c: &Regression, row: &Row| log_joint(c, row, &knots, &floor);
+            assign(&components, &seen, &mut shares, joint);
+        } else {
+            assign(&components, &seen, &mut shares, queried);
         }
-        shares.chunks_exact_mut(stride).for_each(normalise);
+        let stride = components.len();
+        for (row, r) in shares.chunks_exact_mut(stride).zip(&new) {
+            row.iter_mut().for_each(|share| *share *= r.weight);
+        }
         let mut joined = old.clone();
         for (k, b) in joined.iter_mut().enumerate() {
             b.join(&Blocks::of(&seen(k), shares.iter().skip(k).step_by(stride)));
@@ -84,7 +92,7 @@ pub(in crate::learn) fn refine<C: Course>(
     };
     Ok(Refined {
         model: C::model(&fitted, calibration)?,
-        rows: new.len(),
+        rows: new.iter().map(|r| r.weight).sum(),
         novel,
     })
 }
@@ -103,13 +111,9 @@ fn variance(blocks: &[Blocks], knot: usize) -> f64 {
 ///
 /// How displacements at different knots vary together is not kept; as they nearly tell the same, the mean of
 /// their log densities stands for them.
-fn log_density(c: &Regression, row: &Row, knots: &[usize; 3], floor: &[f64; 3]) -> f64 {
+fn log_joint(c: &Regression, row: &Row, knots: &[usize; 3], floor: &[f64; 3]) -> f64 {
     let e = row.features - c.mean;
-    let log_det: f64 = c.factor.diagonal().iter().map(|d| d.ln()).sum();
-    let Some(z) = c.factor.solve_lower_triangular(&e) else {
-        return f64::NEG_INFINITY;
-    };
-    let mut l = c.weight.ln() - log_det - 0.5 * z.norm_squared();
+    let mut l = super::log_density(c, row);
     for (&knot, &floor) in knots.iter().zip(floor) {
         let at = 3 * knot;
         let foretold = |d: usize| {
@@ -124,18 +128,7 @@ fn log_density(c: &Regression, row: &Row, knots: &[usize; 3], floor: &[f64; 3]) 
             l -= (0.5 * error.dot(&v.solve(&error)) + half_ln_det) / knots.len() as f64;
         }
     }
-    if l.is_nan() { f64::NEG_INFINITY } else { l }
-}
-
-fn normalise(l: &mut [f64]) {
-    let max = l.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    if max == f64::NEG_INFINITY {
-        l.fill(1.0 / l.len() as f64);
-        return;
-    }
-    l.iter_mut().for_each(|v| *v = (*v - max).exp());
-    let sum: f64 = l.iter().sum();
-    l.iter_mut().for_each(|v| *v /= sum);
+    l
 }
 
 /// What `before` demonstrations have shown and what one more has. After a single one there was nothing to try the
@@ -191,9 +184,10 @@ mod tests {
             .collect();
         let options = PredictorOptions {
             components: 5,
+            characters: vec![Character::ABRUPT],
             ..PredictorOptions::default()
         };
-        let model = train(&all, &options, 0, &mut |_| ()).unwrap();
+        let model = train(&all, &[], &options, 0, &mut |_| ()).unwrap();
         (all, model)
     }
 
@@ -201,11 +195,11 @@ mod tests {
     #[test]
     fn what_regressions_give_back_makes_them_again() {
         let (all, model) = trained();
-        let rows: usize = all.iter().map(row_count).sum();
-        let options = em_options(&PredictorOptions::default());
-        let back = blocks::recovered(model.components(), rows as f64, &options);
+        let rows: f64 = all.iter().map(|d| row_count(d, 0.3)).sum();
+        let options = em_options(&Character::ABRUPT);
+        let back = blocks::recovered(model.components(), rows, &options);
         let counted: f64 = back.iter().map(|b| b.n).sum();
-        assert!((counted - rows as f64).abs() < 1e-6, "{counted} of {rows}");
+        assert!((counted - rows).abs() < 1e-6, "{counted} of {rows}");
         let scaling = Scaling {
             features: model.standardisation().clone(),
             target_mean: [0.0; TARGETS],
@@ -232,9 +226,9 @@ mod tests {
             target_mean: [0.0; TARGETS],
             target_scale: [1.0; TARGETS],
         };
-        let rows: Vec<Row> = rows_of::<Places>(&all[0], 24, &UnitQuaternion::identity())
+        let rows: Vec<Row> = with_copies::<Places>(&all[0], 24, &UnitQuaternion::identity(), 0.0)
             .iter()
-            .map(|row| scale_row(row, &scaling))
+            .map(|row| scaling.row(row))
             .collect();
         let shares: Vec<f64> = (0..rows.len()).map(|i| 0.2 + 0.01 * i as f64).collect();
         let whole = Blocks::of(&rows, shares.iter());

@@ -9,7 +9,7 @@ fn refused(reason: Refusal) -> RobotControl {
     RobotControl::Refused { reason }
 }
 
-fn state(state: RobotState, cause: Cause) -> RobotControl {
+pub(super) fn state(state: RobotState, cause: Cause) -> RobotControl {
     RobotControl::State {
         state,
         cause,
@@ -84,12 +84,7 @@ fn every_refusal_but_a_divergence_ends_the_attempt() {
 
 #[test]
 fn what_a_declined_request_took_is_not_counted() {
-    // A hand that is in two places at once.
-    let config = SessionConfig {
-        glitch_gate: false,
-        ..SessionConfig::default()
-    };
-    let mut bench = Bench::ready(config, None);
+    let mut bench = Bench::ready(SessionConfig::default(), None);
     bench.sample(home());
     for reason in [Refusal::ClockUnknown, Refusal::Moving] {
         bench.session.engage(bench.now);
@@ -179,7 +174,7 @@ fn a_stop_is_repeated_until_the_robot_has_stopped() {
     assert_eq!(bench.datagrams.len(), 2, "no other state ends it");
     assert!(!bench.session.reset(), "there is nothing to leave yet");
     bench.session.engage(bench.now);
-    bench.session.play(&plan());
+    bench.session.play(&plan(), None);
     bench.drain();
     assert!(bench.control.is_empty());
     assert_eq!(bench.events, vec![Event::Refused(Refusal::Stopped); 2]);
@@ -203,7 +198,7 @@ fn a_stop_is_repeated_until_the_robot_has_stopped() {
 fn a_plan_is_engaged_once_stored_and_kept_going() {
     let mut bench = Bench::ready(SessionConfig::default(), None);
     let plan = plan();
-    bench.session.play(&plan);
+    bench.session.play(&plan, None);
     bench.idle(1000);
     let bytes = codec::encode(&plan);
     assert_eq!(bench.control, [OperatorControl::Plan { id: 1, bytes }]);
@@ -230,6 +225,7 @@ fn a_plan_is_engaged_once_stored_and_kept_going() {
             seq: i,
             t_us: begun.0 / 1000 + 100_000 * i64::from(i),
             lease_ms: 650,
+            bend: None,
         })
         .collect();
     assert_eq!(bench.datagrams, expected);

@@ -90,7 +90,7 @@ fn the_path_waits_for_the_truth() {
 #[test]
 fn a_wrist_that_flips_for_a_frame_does_not_turn_the_tool() {
     let mut bench = Bench::engaged(telling(true), None);
-    let mut sample = |bench: &mut Bench, i: i32, turned: f64| {
+    let sample = |bench: &mut Bench, i: i32, turned: f64| {
         bench.idle(33);
         let mut sample = HandSample::at(bench.now, along(i));
         sample.orientation = Some(UnitQuaternion::from_euler_angles(0.0, 0.0, turned));
@@ -99,7 +99,9 @@ fn a_wrist_that_flips_for_a_frame_does_not_turn_the_tool() {
         let motions = bench.motions();
         motions.last().unwrap().pose.turn.unwrap()
     };
-    (0..20).for_each(|i| drop(sample(&mut bench, i, 0.01 * f64::from(i))));
+    for i in 0..20 {
+        sample(&mut bench, i, 0.01 * f64::from(i));
+    }
     sample(&mut bench, 20, 3.0);
     let told = sample(&mut bench, 21, 0.21).dequantise(Stamp::ZERO);
     assert!(

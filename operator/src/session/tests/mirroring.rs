@@ -23,7 +23,6 @@ fn a_request_carries_the_hand_and_the_mapping() {
         rotation: UnitQuaternion::from_euler_angles(0.1, 0.2, 0.3),
         path_bound_m: Some(0.0123),
         scale: Some(0.2),
-        glitch_gate: false,
         ..SessionConfig::default()
     };
     let skill = example(2, 24);
@@ -365,7 +364,6 @@ fn a_path_that_no_datagram_delivers_goes_by_the_stream_to_its_last_sample() {
     const BOUND_M: f64 = 0.002;
     let config = SessionConfig {
         path_bound_m: Some(BOUND_M),
-        glitch_gate: false,
         ..bound(0.05)
     };
     let mut bench = Bench::engaged(config, None);

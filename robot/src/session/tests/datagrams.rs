@@ -2,6 +2,7 @@
 
 use super::*;
 use telemime_protocol::predict::{Forecast, checksum};
+use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::v1::model_tag;
 
 fn go(bench: &Bench, seq: u32, ms_ago: i64) -> OperatorDatagram {
@@ -11,6 +12,7 @@ fn go(bench: &Bench, seq: u32, ms_ago: i64) -> OperatorDatagram {
         seq,
         t_us: bench.stamp(ms_ago).0 / 1000,
         lease_ms: 650,
+        bend: None,
     }
 }
 
@@ -229,6 +231,81 @@ fn goes_extend_the_lease_in_order_and_within_time() {
     let motion = bench.motion(9, 50);
     bench.send(&motion);
     assert!(bench.orders.is_empty(), "no hand drives a plan");
+}
+
+/// A hand that holds on, its sample `ms_ago` old when the message is sent now.
+fn bent(bench: &Bench, ms_ago: i64) -> WireBend {
+    let mut state = moving(bench.stamp(ms_ago));
+    state.x -= hand();
+    state.memory.iter_mut().for_each(|m| *m -= hand());
+    WireBend {
+        plan_us: 700_000,
+        rate: 64,
+        left: [100, 0, 0],
+        held: Some(WireHeld {
+            state: WireState::quantise(&state).unwrap(),
+            gain: 255,
+            straight: 128,
+            weight: [127, 0, 64, 0, 0, 0],
+        }),
+    }
+}
+
+#[test]
+fn what_a_hand_makes_of_a_plan_is_ordered_on_the_robots_clock() {
+    let mut bench = playing();
+    let with = |bench: &Bench, number: u32, ms_ago: i64, bend| match go(bench, number, ms_ago) {
+        OperatorDatagram::Go {
+            epoch,
+            engagement,
+            seq,
+            t_us,
+            lease_ms,
+            ..
+        } => OperatorDatagram::Go {
+            epoch,
+            engagement,
+            seq,
+            t_us,
+            lease_ms,
+            bend: Some(bend),
+        },
+        other => other,
+    };
+    let bend = bent(&bench, 110);
+    let go = with(&bench, 1, 100, bend);
+    bench.datagram(&go);
+    let [
+        Order::Extend {
+            bent: Some(bent), ..
+        },
+    ] = &bench.orders[..]
+    else {
+        panic!("{:?}", bench.orders)
+    };
+    let near = |at: Mono, ms_ago: i64| (at.0 - (bench.now.0 - ms_ago * MS)).abs() < MS;
+    assert!(near(bent.at, 100) && near(bent.sampled_at, 110));
+    assert_eq!(bent.bend, bend.dequantise());
+    assert!((bent.plan_s(bench.now) - 0.75).abs() < 1e-3);
+
+    // Later than it was sent, by more than clocks are off; and from beyond the ranges.
+    let future = with(&bench, 2, 0, super::datagrams::bent(&bench, -600));
+    let mut weightless = bend;
+    if let Some(held) = &mut weightless.held {
+        held.weight[0] = -1;
+    }
+    let fast = WireBend { rate: 193, ..bend };
+    let wrong = [
+        future,
+        with(&bench, 2, 0, weightless),
+        with(&bench, 2, 0, fast),
+    ];
+    for (i, wrong) in wrong.iter().enumerate() {
+        bench.forget();
+        bench.datagram(wrong);
+        assert!(bench.orders.is_empty(), "{i}");
+        assert_eq!(bench.dropped(), i as u32 + 1);
+    }
 }
 
 #[test]

@@ -1,0 +1,298 @@
+//! How a robot is reached, the first time and after every loss of the link.
+//!
+//! A link that has just come back carries a *fresh* attempt at once, while an older one waits for a retransmission
+//! that QUIC has put off further and further. So attempts begin at a steady pace and overlap; the first of
+//! them that the robot greets is the session, and the others are dropped. Once a robot has answered one of them at
+//! all, no further ones begin for a while: on a thin link they would only stand in its way.
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use quinn::{Connecting, Connection, Endpoint};
+use telemime_endpoint::control::{Control, ControlError, Writer};
+use telemime_endpoint::quic::{self, Refusal};
+use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::hello::{Answer, RejectCode};
+use telemime_protocol::wire::{Version, Versions};
+use tokio::sync::{mpsc, watch};
+use tokio::task::JoinSet;
+use tokio::time::{Instant, sleep_until, timeout};
+
+/// Attempts begin this far apart.
+pub const REDIAL: Duration = Duration::from_millis(250);
+
+/// Attempts begin this many times as far apart as the first packets' own length took on the last link, if that is
+/// more; but no farther than [`SLOWEST_REDIAL`]. Each is two packets of 1.2 kB: on 64 kbit/s, four a second would fill a
+/// queue for ever.
+const LENGTHS: u32 = 3;
+const SLOWEST_REDIAL: Duration = Duration::from_secs(1);
+
+/// An attempt is given at least this long, and at least this many of the round trips last seen.
+const LEAST_ATTEMPT: Duration = Duration::from_millis(500);
+const ROUND_TRIPS: u32 = 4;
+
+/// No further attempt begins for so long after a robot has answered one: the link is there, and the handshake has all of
+/// it. Should it die again, the next attempt is no later than this.
+const UNDISTURBED: Duration = Duration::from_secs(2);
+
+/// The longest time-out of an attempt.
+const LONGEST_ATTEMPT: Duration = Duration::from_secs(10);
+
+/// Application close code of a robot that does not trust our key (docs/protocol.md §1).
+const NOT_TRUSTED: u32 = 5;
+
+/// A session's connection, greeted.
+pub(crate) struct Link {
+    pub(crate) connection: Connection,
+    pub(crate) writer: Writer,
+    pub(crate) frames: mpsc::Receiver<Result<Frame, ControlError>>,
+    pub(crate) epoch: u32,
+    pub(crate) version: Version,
+    /// From the first packet to the answer; more than the round trip by what their lengths take.
+    answered: Duration,
+}
+
+impl Link {
+    /// What is to be known of the link, once it is lost.
+    pub(crate) fn seen(&self) -> Seen {
+        Seen {
+            rtt: self.connection.rtt(),
+            answered: self.answered,
+        }
+    }
+}
+
+/// What the last link was like.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Seen {
+    pub(crate) rtt: Duration,
+    answered: Duration,
+}
+
+/// Why an attempt did not become a session.
+#[derive(Debug)]
+pub(crate) enum DialError {
+    /// The next one may.
+    Again(String),
+    /// The robot declines.
+    Rejected { code: RejectCode, text: String },
+    /// The robot's key is not the one that is pinned.
+    KeyChanged,
+    /// The robot has revoked our key.
+    Revoked,
+}
+
+/// How long attempts may take.
+///
+/// Most are given four round trips, no less than 0.5 s: time enough if the link is what it was. One at a time is
+/// *patient*: its time-out doubles as such attempts fail, up to 10 s, for a link that has become slower. If all
+/// were, forty of them would be retransmitting after a longer outage.
+#[derive(Debug, Clone, Copy)]
+struct Pace {
+    apart: Duration,
+    brisk: Duration,
+    patient: Duration,
+}
+
+impl Pace {
+    fn new(seen: Option<Seen>) -> Self {
+        let (brisk, lengths) = seen.map_or((LEAST_ATTEMPT, Duration::ZERO), |seen| {
+            let lengths = seen.answered.saturating_sub(seen.rtt);
+            (seen.rtt * ROUND_TRIPS + lengths, lengths)
+        });
+        let brisk = brisk.clamp(LEAST_ATTEMPT, LONGEST_ATTEMPT);
+        Self {
+            apart: (lengths * LENGTHS).clamp(REDIAL, SLOWEST_REDIAL),
+            brisk,
+            patient: brisk,
+        }
+    }
+
+    fn next_patient(&mut self) -> Duration {
+        self.patient = (self.patient * 2).min(LONGEST_ATTEMPT);
+        self.patient
+    }
+}
+
+/// Attempts under way.
+pub(crate) struct Dialler {
+    endpoint: Endpoint,
+    robot: SocketAddr,
+    offered: Versions,
+    pace: Pace,
+    attempts: JoinSet<(bool, Result<Link, DialError>)>,
+    patient: bool,
+    answered_tx: watch::Sender<Option<Instant>>,
+    next: Instant,
+}
+
+impl Dialler {
+    /// Begins with the first poll of [`Dialler::next`]; `seen` is what the last link was like.
+    pub(crate) fn new(
+        endpoint: &Endpoint,
+        robot: SocketAddr,
+        offered: Versions,
+        seen: Option<Seen>,
+    ) -> Self {
+        Self {
+            endpoint: endpoint.clone(),
+            robot,
+            offered,
+            pace: Pace::new(seen),
+            attempts: JoinSet::new(),
+            patient: false,
+            answered_tx: watch::Sender::new(None),
+            next: Instant::now(),
+        }
+    }
+
+    /// The outcome of an attempt; `None` when a new one has begun instead, so that the caller looks up from time
+    /// to time. Loses nothing if it is dropped.
+    pub(crate) async fn next(&mut self) -> Option<Result<Link, DialError>> {
+        tokio::select! {
+            biased;
+            Some(done) = self.attempts.join_next(), if !self.attempts.is_empty() => {
+                let (patient, outcome) = done.unwrap_or_else(|e| (false, Err(DialError::Again(e.to_string()))));
+                if patient {
+                    self.patient = false;
+                }
+                if outcome.is_err() {
+                    // What was left undisturbed has failed: on with the others.
+                    self.answered_tx.send_replace(None);
+                }
+                Some(outcome)
+            }
+            () = sleep_until(self.next) => {
+                let now = Instant::now();
+                self.next = now + self.pace.apart;
+                let answered = *self.answered_tx.borrow();
+                if !self.attempts.is_empty() && answered.is_some_and(|at| now < at + UNDISTURBED) {
+                    return None;
+                }
+                let patient = !std::mem::replace(&mut self.patient, true);
+                let within = if patient { self.pace.next_patient() } else { self.pace.brisk };
+                let attempt = attempt(self.endpoint.clone(), self.robot, self.offered, within, self.answered_tx.clone());
+                self.attempts.spawn(async move { (patient, attempt.await) });
+                None
+            }
+        }
+    }
+}
+
+/// An attempt is given `within` to be answered at all, and then as long as the longest.
+async fn attempt(
+    endpoint: Endpoint,
+    robot: SocketAddr,
+    offered: Versions,
+    within: Duration,
+    answered: watch::Sender<Option<Instant>>,
+) -> Result<Link, DialError> {
+    let begun = Instant::now();
+    let mut connecting = endpoint
+        .connect(robot, "telemime")
+        .map_err(|e| DialError::Again(e.to_string()))?;
+    let silent =
+        |_| DialError::Again("no answer: is the robot running, and does UDP reach it?".to_owned());
+    let answer = timeout(within, connecting.handshake_data()).await;
+    answer.map_err(silent)?.map_err(|e| failed(&e))?;
+    let now = Instant::now();
+    answered.send_replace(Some(now));
+    let rest = timeout(LONGEST_ATTEMPT, connect(connecting, offered, now - begun)).await;
+    rest.map_err(silent)?
+}
+
+async fn connect(
+    connecting: Connecting,
+    offered: Versions,
+    answered: Duration,
+) -> Result<Link, DialError> {
+    let connection = connecting.await.map_err(|e| failed(&e))?;
+    // With TLS 1.3 the handshake seems complete before the server has looked at our key.
+    let again = |e: ControlError| match &e {
+        ControlError::Connection(lost) => failed(lost),
+        _ => connection
+            .close_reason()
+            .map_or_else(|| DialError::Again(e.to_string()), |lost| failed(&lost)),
+    };
+    let mut control = Control::open(&connection).await.map_err(again)?;
+    let hello = offered.hello().encode();
+    control.write(&hello).await.map_err(again)?;
+    match control.answer().await.map_err(again)? {
+        Answer::Ack { version, epoch, .. } => {
+            let Some(version) = offered.known(version) else {
+                return Err(DialError::Rejected {
+                    code: RejectCode::Version,
+                    text: format!("it answers with version {version}, which we did not offer"),
+                });
+            };
+            let (writer, frames) = control.into_frames();
+            Ok(Link {
+                connection,
+                writer,
+                frames,
+                epoch,
+                version,
+                answered,
+            })
+        }
+        Answer::Reject { code, text } => Err(DialError::Rejected { code, text }),
+    }
+}
+
+fn failed(error: &quinn::ConnectionError) -> DialError {
+    if let quinn::ConnectionError::ApplicationClosed(close) = error
+        && close.error_code == NOT_TRUSTED.into()
+    {
+        return DialError::Again(quic::explain(error));
+    }
+    match quic::refusal(error) {
+        Some(Refusal::KeyUnknown | Refusal::KeyRevoked) => DialError::KeyChanged,
+        Some(Refusal::OurKeyRevoked) => DialError::Revoked,
+        Some(Refusal::OurKeyUnknown | Refusal::Version) | None => {
+            DialError::Again(quic::explain(error))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn attempts_take_four_round_trips_and_one_of_them_is_ever_more_patient() {
+        let ms = Duration::from_millis;
+        for (rtt, brisk) in [
+            (None, 500),
+            (Some(20), 500),
+            (Some(125), 520),
+            (Some(600), 2420),
+            (Some(60_000), 10_000),
+        ] {
+            let seen = |rtt| Seen {
+                rtt: ms(rtt),
+                answered: ms(rtt + 20),
+            };
+            let mut pace = Pace::new(rtt.map(seen));
+            assert_eq!(pace.apart, REDIAL, "{rtt:?}");
+            assert_eq!(pace.brisk, ms(brisk), "{rtt:?}");
+            let mut due = brisk;
+            for _ in 0..8 {
+                due = (2 * due).min(10_000);
+                assert_eq!(pace.next_patient(), ms(due));
+            }
+            assert_eq!(due, 10_000);
+        }
+    }
+
+    #[test]
+    fn on_a_thin_link_attempts_are_farther_apart() {
+        let ms = Duration::from_millis;
+        for (answered, apart) in [(180, 250), (300, 600), (3_000, 1_000)] {
+            let seen = Seen {
+                rtt: ms(100),
+                answered: ms(answered),
+            };
+            assert_eq!(Pace::new(Some(seen)).apart, ms(apart));
+        }
+    }
+}

@@ -1,0 +1,164 @@
+//! What the robot says: lines to read, or events for machines.
+
+use std::net::SocketAddr;
+
+use serde::{Deserialize, Serialize};
+use telemime_endpoint::cli::Printer;
+use telemime_endpoint::pairing::Candidate;
+
+use crate::desk::Progress;
+use crate::servo::Report;
+
+/// What the robot prints with `--json`; `docs/commands.md` lists the fields.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+#[expect(
+    missing_docs,
+    reason = "the fields are documented where users look: docs/commands.md"
+)]
+pub enum Event {
+    Listening {
+        addr: SocketAddr,
+        fingerprint: String,
+        arm: String,
+        joints: usize,
+        lag_s: f64,
+        radius_m: f64,
+    },
+    Connected {
+        epoch: u32,
+        version: u16,
+        peer: SocketAddr,
+    },
+    Disconnected {
+        why: String,
+        received: u32,
+        dropped: u32,
+        clock_offset_s: Option<f64>,
+        clock_bound_s: Option<f64>,
+        clock_origin: String,
+    },
+    Refused {
+        reason: String,
+        peer: SocketAddr,
+        why: String,
+        times: u32,
+    },
+    Pairing {
+        stage: String,
+        seconds: Option<f64>,
+        name: Option<String>,
+        fingerprint: Option<String>,
+        code: Option<String>,
+        why: Option<String>,
+    },
+    State {
+        state: String,
+        cause: String,
+        mono_ns: i64,
+    },
+    Engaged {
+        engagement: u32,
+        mono_ns: i64,
+        scale: f64,
+        rotation: [f64; 4],
+        hand_m: [f64; 3],
+        tip_m: [f64; 3],
+        hand_q: Option<[f64; 4]>,
+        tip_q: [f64; 4],
+    },
+    Path {
+        knots: Vec<(f64, [f64; 3], [f64; 3], bool)>,
+    },
+    Servo {
+        ticks: u64,
+        mean_ns: u32,
+        p99_ns: u32,
+        overruns: u32,
+    },
+}
+
+#[derive(Clone)]
+pub(super) struct Log {
+    pub(super) json: bool,
+    pub(super) out: Printer,
+}
+
+impl Log {
+    pub(super) fn say(&self, event: &Event, text: impl FnOnce() -> String) {
+        if self.json {
+            self.out.emit(event);
+        } else {
+            self.out.say(text());
+        }
+    }
+
+    pub(super) fn pairing(&self, progress: &Progress) {
+        let (stage, candidate) = match progress {
+            Progress::Open(_) => ("open", None),
+            Progress::TooSoon(_) => ("too_soon", None),
+            Progress::Code(candidate) => ("code", Some(candidate)),
+            Progress::Paired(candidate) => ("paired", Some(candidate)),
+            Progress::Ended(_) => ("ended", None),
+            Progress::Nothing => ("nothing", None),
+        };
+        let (seconds, why) = match progress {
+            Progress::Open(span) | Progress::TooSoon(span) => (Some(span.as_secs_f64()), None),
+            Progress::Ended(why) => (None, Some(why.to_string())),
+            _ => (None, None),
+        };
+        let text = || match progress {
+            Progress::Open(span) => format!(
+                "pairing: the window is open for {:.0} s and one attempt; at the operator, run telemime pair HOST:PORT",
+                span.as_secs_f64()
+            ),
+            Progress::TooSoon(span) => {
+                format!(
+                    "pairing: too soon after the last window; wait {:.0} s",
+                    span.as_secs_f64().ceil()
+                )
+            }
+            Progress::Code(Candidate { name, key, code }) => format!(
+                "pairing: operator {name}, key {}\n\n    {code}\n\nDoes the operator show the same? Type yes or no.",
+                key.short()
+            ),
+            Progress::Paired(Candidate { name, key, .. }) => {
+                format!("pairing: operator {name} is trusted from now on\nfingerprint {key}")
+            }
+            Progress::Ended(why) => format!("pairing: ended without one: {why}"),
+            Progress::Nothing => "pairing: there is nothing to say yes or no to".to_owned(),
+        };
+        let event = Event::Pairing {
+            stage: stage.to_owned(),
+            seconds,
+            name: candidate.map(|c| c.name.to_string()),
+            fingerprint: candidate.map(|c| c.key.to_string()),
+            code: candidate.map(|c| c.code.to_string()),
+            why,
+        };
+        self.say(&event, text);
+    }
+}
+
+/// How often somebody was turned away, if not for the first time.
+pub(super) fn nth(times: u32) -> String {
+    if times > 1 {
+        format!(" (for the {times}th time)")
+    } else {
+        String::new()
+    }
+}
+
+pub(super) fn engaged(report: &Report) -> Event {
+    let scalar_first = |q: &nalgebra::UnitQuaternion<f64>| [q.w, q.i, q.j, q.k];
+    Event::Engaged {
+        engagement: report.engagement.number,
+        mono_ns: report.engaged_at.0,
+        scale: report.mapping.scale,
+        rotation: scalar_first(&report.mapping.rotation),
+        hand_m: report.mapping.hand_m.into(),
+        tip_m: report.mapping.tip_m.into(),
+        hand_q: report.mapping.hand_orientation.as_ref().map(scalar_first),
+        tip_q: scalar_first(&report.mapping.tip_orientation),
+    }
+}
