@@ -157,7 +157,7 @@ fn a_demand_far_outside_keeps_every_joint_within_limits() {
     // And it comes back.
     let start = rig.start;
     let mut last = f64::NAN;
-    for _ in 0..6000 {
+    for _i in 0..6000 {
         let (q, qd) = (*rig.plant.q(), *rig.plant.qd());
         let out = rig.controller.tick(
             Demand::Follow {
@@ -170,6 +170,13 @@ fn a_demand_far_outside_keeps_every_joint_within_limits() {
         );
         rig.plant.step(&out.tau, DT);
         last = (out.tip - start).norm();
+        if _i % 600 == 0 {
+            let mut h = telemime_sim::arm::SelfCollision::new(&rig.arm, &rig.home, 0.03);
+            let mut k = Kinematics::new();
+            k.update(&rig.arm, rig.plant.q());
+            h.place(&k);
+            println!("{last} {:?} {:?} tip {:?} q {:?}", out.clamps, h.nearest(), out.tip.as_slice(), rig.plant.q().as_slice());
+        }
     }
     assert!(last < 1e-3, "{last} m from the start");
 }
