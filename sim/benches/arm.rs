@@ -4,7 +4,10 @@ use std::sync::Arc;
 
 use divan::{Bencher, black_box};
 use serde_json::Value;
-use telemime_sim::arm::{ArmModel, Dynamics, Joints, Kinematics, LoadOptions, Plant};
+use telemime_sim::arm::{
+    ArmModel, Dynamics, Integrator, Joints, Kinematics, LoadOptions, Plant, SelfCollision,
+    default_urdf,
+};
 
 fn main() {
     divan::main();
@@ -101,12 +104,39 @@ fn aba(bencher: Bencher, axes: usize) {
     });
 }
 
-/// One millisecond of the simulated arm: four substeps.
-#[divan::bench(args = ARMS)]
-fn plant_tick(bencher: Bencher, axes: usize) {
+fn plant(axes: usize, integrator: Integrator) -> Plant {
     let State { arm, .. } = state(axes);
     let start = arm.per_joint(telemime_sim::arm::Joint::mid);
-    let mut plant = Plant::new(arm, &start).expect("mid-range is a posture");
+    let plant = Plant::new(arm, &start).expect("mid-range is a posture");
+    plant.integrated_by(integrator)
+}
+
+/// One millisecond of the simulated arm: four substeps.
+#[divan::bench(args = ARMS)]
+fn tick_euler(bencher: Bencher, axes: usize) {
+    let mut plant = plant(axes, Integrator::SemiImplicit);
     let tau = Joints::zeros();
     bencher.bench_local(|| plant.step(black_box(&tau), 1e-3));
+}
+
+/// The same by Runge and Kutta: four substeps of four.
+#[divan::bench(args = ARMS)]
+fn tick_rk4(bencher: Bencher, axes: usize) {
+    let mut plant = plant(axes, Integrator::Rk4);
+    let tau = Joints::zeros();
+    bencher.bench_local(|| plant.step(black_box(&tau), 1e-3));
+}
+
+/// Seven links placed, and the nearest of all pairs that are kept apart.
+#[divan::bench]
+fn nearest(bencher: Bencher) {
+    let arm = ArmModel::from_urdf(default_urdf(), &LoadOptions::default()).expect("our own");
+    let start = arm.per_joint(telemime_sim::arm::Joint::mid);
+    let mut hulls = SelfCollision::new(&arm, &start, 0.02);
+    let mut kinematics = Kinematics::new();
+    bencher.bench_local(|| {
+        kinematics.update(&arm, black_box(&start));
+        hulls.place(&kinematics);
+        hulls.nearest()
+    });
 }
