@@ -296,7 +296,8 @@ impl Shift {
                 }
                 Notice::Performed { zero, .. } => {
                     driver.zeros.push(zero);
-                    driver.follows = false;
+                    // Had it been stopped before the hand had done, it would not say so, and the next is another engagement.
+                    (driver.follows, driver.stopped) = (false, false);
                 }
                 Notice::Mapping { path_bound_m, .. } => driver.path_bound_m = path_bound_m,
                 _ => {}
@@ -693,6 +694,7 @@ fn deviation(path: &Path, hand: &Samples, zero: Stamp) -> (u32, f64) {
 }
 
 fn shift(seed: u64, span_s: f64) -> (Seen, Tally) {
+    skill();
     run_virtual(async move { Shift::start(seed).work(span_s).await }).unwrap()
 }
 
