@@ -30,16 +30,23 @@ use telemime_protocol::wire::hello::{Answer, Hello};
 use telemime_protocol::wire::v1::{RobotState, VERSION};
 use telemime_robot::daemon::Notice as RobotNotice;
 use telemime_robot::door;
-use telemime_robot::rig::Rig;
+use telemime_robot::control::ControlConfig;
+use telemime_robot::rig::{Rig, RigOptions};
 use telemime_sim::link::LinkConfig;
 
 use crate::play;
-use crate::scene::{REST_S, Samples, recording, rig, skill};
+use crate::scene::{REST_S, Samples, recording, skill};
 use model::{Model, Seen, follows};
-use script::{Mischief, hand, is_clean, link, spread};
+use script::{Mischief, hand, is_clean, is_usable, link, spread};
 
 /// A shift is one robot's (restarts aside), and repeats alone.
 const SHIFT_S: f64 = 600.0;
+
+/// The servo's period.
+const TICK_S: f64 = 3e-3;
+
+/// An operator that has a session and something to do has asked, and been granted or left, within this time, s.
+const IDLE_S: f64 = 25.0;
 
 /// What the suite takes.
 const HOURS: f64 = 0.5;
@@ -64,6 +71,8 @@ struct Driver {
     name: String,
     operator: Operator,
     hands: Vec<Samples>,
+    plays: bool,
+    began_at: Mono,
     links: [LinkConfig; 2],
     path_bound_m: f64,
     /// Performances that are over, and when each recording's time was 0.
@@ -114,10 +123,23 @@ struct Tally {
     mischief: BTreeMap<String, u32>,
 }
 
+/// The arm's dynamics are most of what a tick costs, and not what is in question here: fewer ticks, more hours.
+fn slow_rig() -> Rig {
+    let control = ControlConfig {
+        dt_s: TICK_S,
+        ..ControlConfig::default()
+    };
+    let options = RigOptions {
+        control,
+        ..RigOptions::default()
+    };
+    Rig::load(&options).unwrap()
+}
+
 impl Shift {
     fn start(seed: u64) -> Self {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
-        let rig = rig();
+        let rig = slow_rig();
         let model = Rc::new(RefCell::new(Model::new(&rig)));
         let watching = Rc::clone(&model);
         let watcher = Rc::new(RefCell::new(move |told: &[_], report: &_| {
@@ -189,9 +211,13 @@ impl Shift {
         }
         let now = self.pair.now();
         let quiet_s = |d: &Driver| now.secs_since(d.heard_at.max(self.disturbed_at));
-        let usable = |l: &LinkConfig| l.loss <= 0.05;
         for driver in &self.drivers {
-            let reached = quiet_s(driver) < PATIENCE_S || !driver.links.iter().all(usable);
+            let idle_s = now.secs_since(driver.began_at.max(self.disturbed_at));
+            let asks = !driver.plays || !driver.granted.is_empty() || idle_s < IDLE_S;
+            self.must(asks || driver.epoch.is_none(), || {
+                format!("{} has played nothing for {idle_s} s", driver.name)
+            });
+            let reached = quiet_s(driver) < PATIENCE_S || !driver.links.iter().all(is_usable);
             self.must(reached, || {
                 format!("{} hears nothing for {} s", driver.name, quiet_s(driver))
             });
@@ -294,6 +320,9 @@ impl Shift {
                     driver.telemetry += 1;
                     driver.heard_at = now;
                 }
+                Notice::Event(_, Event::Refused(reason)) => {
+                    noted.push(format!("is refused: {reason:?}"));
+                }
                 Notice::Performed { zero, .. } => {
                     driver.zeros.push(zero);
                     // Had it been stopped before the hand had done, it would not say so, and the next is another engagement.
@@ -373,6 +402,8 @@ impl Shift {
             name: format!("operator {}", self.started),
             operator: operator.unwrap(),
             hands: if plays { Vec::new() } else { hands },
+            plays,
+            began_at: self.pair.now(),
             links: links.clone(),
             path_bound_m: f64::INFINITY,
             zeros: Vec::new(),
@@ -386,9 +417,11 @@ impl Shift {
             sessions: 0,
         };
         self.note(format!(
-            "{} starts ({}), {links:?}",
+            "{} {}: up {}, down {}",
             driver.name,
-            if plays { "plays" } else { "mirrors" }
+            if plays { "plays" } else { "mirrors" },
+            links[0],
+            links[1],
         ));
         self.drivers.push(driver);
         self.wire(self.drivers.len() - 1, seed);
@@ -581,6 +614,8 @@ impl Shift {
             Mischief::Links => {
                 self.drivers[i].links = [link(&mut self.rng), link(&mut self.rng)];
                 let seed = self.rng.random();
+                let [up, down] = &self.drivers[i].links;
+                self.note(format!("up {up}, down {down}"));
                 self.wire(i, seed);
             }
             Mischief::Outage => {
@@ -722,7 +757,7 @@ fn whatever_befalls_them_what_must_hold_holds() {
         paths += tally.paths;
     }
     if one.is_none() {
-        let share = following as f64 / (hours * 3.6e6);
+        let share = following as f64 * TICK_S / (hours * 3600.0);
         assert!(share > 0.1, "{share} of the time followed");
         let at_least = (hours * 50.0) as u32;
         assert!(engagements > at_least, "{engagements} engagements");

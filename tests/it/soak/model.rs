@@ -17,11 +17,8 @@ pub(super) const LEASE_S: f64 = 0.65;
 /// A sample older than this authorises nothing beyond, s (the robot's default).
 const MAX_DELAY_S: f64 = 0.5;
 
-/// A stop typed at the robot acts within so many seconds.
-const LOCAL_STOP_S: f64 = 3e-3;
-
-/// Orders reach the servo within so many seconds of the message that made them.
-const PROMPT_S: f64 = 5e-3;
+/// A stop typed at the robot acts within so many ticks, and orders reach the servo.
+const PROMPT_TICKS: f64 = 2.0;
 
 /// Events kept to be shown when something breaks.
 const KEPT: usize = 80;
@@ -218,7 +215,8 @@ impl Model {
     /// A lease is fixed when its message arrives, and no longer than what is granted for a sample of that age.
     fn lease(&mut self, at: Mono, lease: Lease, valid_at: Option<Mono>) {
         let waited_s = at.secs_since(lease.from);
-        self.must((0.0..=PROMPT_S).contains(&waited_s), at, || {
+        let most_s = PROMPT_TICKS * self.rig.tick_s();
+        self.must((0.0..=most_s).contains(&waited_s), at, || {
             format!("an order waited {waited_s} s")
         });
         let span_s = lease.until.secs_since(lease.from);
@@ -281,9 +279,10 @@ impl Model {
                 || "a change that is not counted".into(),
             );
         }
+        let most_s = PROMPT_TICKS * self.rig.tick_s();
         let due = self
             .stopped_here
-            .is_some_and(|since| at.secs_since(since) > LOCAL_STOP_S);
+            .is_some_and(|since| at.secs_since(since) > most_s);
         let stopped = is == RobotState::Stopped && cause == Cause::LocalStop;
         self.must(!due || stopped, at, || {
             format!("{is:?} ({cause:?}) after a stop at the robot")

@@ -2,7 +2,7 @@
 
 use nalgebra::Vector3;
 use rand::{Rng, RngExt};
-use telemime_sim::link::LinkConfig;
+use telemime_sim::link::{Chance, Distribution, LinkConfig, Loss, Probability, Rate};
 
 use crate::scene::{Samples, performance};
 
@@ -81,24 +81,67 @@ pub(super) fn spread(rng: &mut impl Rng, from: f64, to: f64) -> f64 {
     (from.ln() + rng.random::<f64>() * (to / from).ln()).exp()
 }
 
-/// One direction of a link; half of them clean.
+/// One direction of a link; half of them are clean, the others anything netem knows.
 pub(super) fn link(rng: &mut impl Rng) -> LinkConfig {
-    let (clean, delay_s) = (rng.random_bool(0.5), spread(rng, 1e-3, 0.2));
+    let delay_s = spread(rng, 1e-3, 0.2);
     let jitter_s = delay_s * rng.random_range(0.0..0.5);
-    let (loss, rate_bit_s) = (spread(rng, 1e-3, 0.3), spread(rng, 2e5, 1e7));
-    let thin = rng.random_bool(0.3);
+    if rng.random_bool(0.5) {
+        return LinkConfig {
+            delay_s,
+            jitter_s: 0.1 * jitter_s,
+            ..LinkConfig::default()
+        };
+    }
+    let share = spread(rng, 1e-3, 0.3);
+    let mut now_and_then = |often, most| {
+        let p = spread(rng, 1e-4, most);
+        Chance::of(if rng.random_bool(often) { p } else { 0.0 })
+    };
+    let (duplicate, corrupt) = (now_and_then(0.3, 0.1), now_and_then(0.3, 0.05));
+    let reorder = now_and_then(0.3, 0.3);
+    let end = rng.random_range(0.1..0.6);
+    let bursts = Loss::Gemodel {
+        p: Probability::of(share * end),
+        r: Probability::of(end),
+        lost_bad: Probability::ALWAYS,
+        lost_good: Probability::NEVER,
+    };
+    let rate = rng
+        .random_bool(0.3)
+        .then(|| Rate::of(spread(rng, 2e5, 1e7)));
+    let distributions = Distribution::ALL;
     LinkConfig {
         delay_s,
-        jitter_s: if clean { 0.1 * jitter_s } else { jitter_s },
-        loss: if clean { 0.0 } else { loss },
-        rate_bit_s: (thin && !clean).then_some(rate_bit_s),
+        jitter_s,
+        distribution: distributions[rng.random_range(0..distributions.len())],
+        loss: if rng.random_bool(0.5) {
+            bursts
+        } else {
+            Loss::random(share)
+        },
+        duplicate,
+        corrupt,
+        reorder,
+        gap: u32::from(reorder != Chance::NEVER),
+        rate,
         ..LinkConfig::default()
     }
 }
 
 /// Whether what is promised is promised of such a link.
 pub(super) fn is_clean(link: &LinkConfig) -> bool {
-    link.loss == 0.0 && link.rate_bit_s.is_none()
+    let wire = LinkConfig {
+        delay_s: link.delay_s,
+        jitter_s: link.jitter_s,
+        ..LinkConfig::default()
+    };
+    *link == wire
+}
+
+/// Whether a session is to be had over such a link whatever happened before.
+pub(super) fn is_usable(link: &LinkConfig) -> bool {
+    let share = link.loss.share();
+    share.is_some_and(|share| share <= 0.05) && link.corrupt.p <= Probability::of(0.05)
 }
 
 /// A hand: swings as the skill knows them, waves it does not know, rests, and goes away for a while.
