@@ -91,13 +91,7 @@ fn drive(config: SessionConfig, hand: impl Fn(u32) -> Samples) -> Cost {
                 rest_s: 0.0,
             });
             let operator = pair
-                .operator(
-                    task,
-                    Some(skill()),
-                    config,
-                    &shaped(),
-                    u64::from(index),
-                )
+                .operator(task, Some(skill()), config, &shaped(), u64::from(index))
                 .unwrap();
             let summary = finish(operator).await.0.unwrap();
             assert_eq!(summary.outcome, Outcome::Completed, "performance {index}");

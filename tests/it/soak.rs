@@ -28,9 +28,9 @@ use telemime_protocol::spline::HermiteSpan;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::hello::{Answer, Hello};
 use telemime_protocol::wire::v1::{RobotState, VERSION};
+use telemime_robot::control::ControlConfig;
 use telemime_robot::daemon::Notice as RobotNotice;
 use telemime_robot::door;
-use telemime_robot::control::ControlConfig;
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_sim::link::LinkConfig;
 

@@ -108,7 +108,7 @@ pub(super) fn link(rng: &mut impl Rng) -> LinkConfig {
     };
     let rate = rng
         .random_bool(0.3)
-        .then(|| Rate::of(spread(rng, 2e5, 1e7)));
+        .then(|| Rate::bits(spread(rng, 2e5, 1e7) as u64));
     let distributions = Distribution::ALL;
     LinkConfig {
         delay_s,
