@@ -41,6 +41,7 @@ struct Cost {
     motion: u64,
     sent: u64,
     received: u64,
+    packets: [u64; 3],
     messages: u64,
     knots: u64,
 }
@@ -53,6 +54,10 @@ impl Cost {
         self.motion += traffic.motion.bytes;
         self.sent += traffic.sent.bytes;
         self.received += traffic.received.bytes;
+        let counts = [traffic.motion, traffic.sent, traffic.received];
+        for (sum, counted) in self.packets.iter_mut().zip(counts) {
+            *sum += counted.packets;
+        }
         self.messages += u64::from(counters.messages);
         self.knots += u64::from(counters.knots);
     }
@@ -64,8 +69,9 @@ impl Cost {
     fn row(&self, name: &str) {
         let per = |bytes: u64, of: f64| bytes as f64 / of;
         println!(
-            "| {name} | {:.1} | {:.1} | {:.1} | {:.0} | {:.0} | {:.0} | {:.0} | {:.3} |",
+            "| {name} | {:.1} | {:.1} | {:.1} | {:.1} | {:.0} | {:.0} | {:.0} | {:.0} | {:.3} |",
             self.messages as f64 / self.seconds,
+            (self.packets[1] - self.packets[0]) as f64 / self.seconds,
             self.knots as f64 / self.seconds,
             per(self.motion, self.messages as f64),
             per(self.motion, self.seconds),
@@ -127,7 +133,7 @@ fn fast(index: u32) -> Samples {
 #[test]
 fn a_live_hand_costs_less_than_its_samples() {
     println!(
-        "| hand, lease | messages/s | knots/s | B a message | B/s of motion | B/s else, up | B/s down | B a knot, all included | of raw |"
+        "| hand, lease | messages/s | other packets up/s | knots/s | B a message | B/s of motion | B/s else, up | B/s down | B a knot, all included | of raw |"
     );
     let usual = drive(SessionConfig::default(), live);
     usual.row("30 Hz, as it comes (1 σ, 650 ms)");
