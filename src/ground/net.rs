@@ -29,6 +29,7 @@ struct State {
     links: BTreeMap<(SocketAddr, SocketAddr), Link>,
     down: bool,
     sockets: u64,
+    under_way: usize,
     tape: Option<Vec<Taped>>,
 }
 
@@ -58,6 +59,7 @@ impl Network {
             links: BTreeMap::new(),
             down: false,
             sockets: 0,
+            under_way: 0,
             tape: None,
         })))
     }
@@ -113,6 +115,18 @@ impl Network {
         count
     }
 
+    /// Delivers a packet that nobody has sent, as if it came from `from`.
+    pub fn forge(&self, from: SocketAddr, to: SocketAddr, packet: Vec<u8>) {
+        self.deliver(from, to, packet);
+    }
+
+    /// Packets on their way, and those that nobody has read yet.
+    pub fn queued(&self) -> (usize, usize) {
+        let state = self.state();
+        let unread = state.inboxes.values().map(|inbox| inbox.packets.len());
+        (state.under_way, unread.sum())
+    }
+
     fn state(&self) -> MutexGuard<'_, State> {
         self.0
             .lock()
@@ -144,8 +158,10 @@ impl Network {
                 continue;
             }
             let at = epoch + Duration::from_nanos(delivery.at_ns.max(0) as u64);
+            self.state().under_way += 1;
             tokio::spawn(async move {
                 sleep_until(at).await;
+                network.state().under_way -= 1;
                 network.deliver(from, to, packet);
             });
         }

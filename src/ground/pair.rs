@@ -24,13 +24,14 @@ use telemime_protocol::time::Stamp;
 use telemime_robot::daemon::{Daemon as RobotDaemon, Notice as RobotNotice};
 use telemime_robot::desk::Desk;
 use telemime_robot::rig::Rig;
-use telemime_robot::servo::{self, Report};
+use telemime_robot::servo::Report;
 use telemime_robot::session::SessionConfig as RobotConfig;
 use telemime_sim::link::LinkConfig;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::net::Network;
+use super::tap::{Watched, Watcher};
 
 /// Why a pair could not run.
 #[derive(Debug, thiserror::Error)]
@@ -79,6 +80,7 @@ pub struct Pair {
     clock: HostClock,
     config: RobotConfig,
     external: Option<(External, External)>,
+    watcher: Option<Watcher>,
     robot_identity: Identity,
     operator_identity: Identity,
     operators: u8,
@@ -93,6 +95,7 @@ pub struct Robot {
     notices: Rc<RefCell<Vec<RobotNotice>>>,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
+    endpoint: quinn::Endpoint,
     tasks: Rc<[tokio::task::AbortHandle; 2]>,
 }
 
@@ -117,17 +120,16 @@ impl Robot {
         identity: &Identity,
         trust: &Trust,
         config: RobotConfig,
-        external: Option<External>,
+        (external, watcher): (Option<External>, Option<Watcher>),
     ) -> Result<Self, PairError> {
-        let (rings, handle) = servo::rings();
-        let mut core = rig.servo(rings);
+        let (mut core, handle) = Watched::new(|rings| rig.servo(rings), clock, watcher);
         let period = Duration::from_secs_f64(core.tick_s());
         let servo = tokio::task::spawn_local(async move {
             let mut tick = interval(period);
             tick.set_missed_tick_behavior(MissedTickBehavior::Burst);
             loop {
                 tick.tick().await;
-                core.tick(clock.now());
+                core.tick();
             }
         });
         let socket = quic::Socket::Abstract {
@@ -135,6 +137,7 @@ impl Robot {
             seed: [1; 32],
         };
         let endpoint = quic::server(identity, trust, socket, &Meter::default())?;
+        let connections = endpoint.clone();
         let own = Own {
             name: Name::made_of("virtual-robot"),
             key: identity.fingerprint(),
@@ -151,6 +154,7 @@ impl Robot {
             notices: Rc::default(),
             quit,
             words,
+            endpoint: connections,
             tasks: Rc::new([servo.abort_handle(), serving.abort_handle()]),
         };
         let log = robot.clone();
@@ -179,6 +183,17 @@ impl Robot {
     /// Everything else it noticed so far.
     pub fn notices(&self) -> std::cell::Ref<'_, Vec<RobotNotice>> {
         self.notices.borrow()
+    }
+
+    /// Forgets every tick and notice so far, and returns the notices: hours do not fit into memory.
+    pub fn forget(&self) -> Vec<RobotNotice> {
+        self.reports.borrow_mut().clear();
+        self.notices.take()
+    }
+
+    /// Connections its endpoint keeps anything of.
+    pub fn connections(&self) -> usize {
+        self.endpoint.open_connections()
     }
 
     /// A word at the robot's own terminal.
@@ -212,6 +227,11 @@ impl Operator {
         Ok(self.endpoint.rebind_abstract(socket)?)
     }
 
+    /// Connections its endpoint keeps anything of.
+    pub fn connections(&self) -> usize {
+        self.endpoint.open_connections()
+    }
+
     /// A word at the operator's own terminal.
     pub fn say(&self, word: Word) {
         // The daemon has ended if nobody hears it.
@@ -238,7 +258,7 @@ impl Pair {
     /// # Errors
     /// [`PairError`].
     pub fn start_with(rig: &Rig, config: RobotConfig) -> Result<Self, PairError> {
-        Self::start_as(rig, config, None)
+        Self::start_as(rig, config, None, None)
     }
 
     /// As [`Pair::start`], with disciplined clocks at the robot and at the operators.
@@ -250,13 +270,27 @@ impl Pair {
         robot: External,
         operators: External,
     ) -> Result<Self, PairError> {
-        Self::start_as(rig, Default::default(), Some((robot, operators)))
+        Self::start_as(rig, Default::default(), Some((robot, operators)), None)
+    }
+
+    /// As [`Pair::start`], under the eyes of `watcher`; with disciplined clocks, the robot's and the operators', if there
+    /// are any.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn start_watched(
+        rig: &Rig,
+        watcher: Watcher,
+        external: Option<(External, External)>,
+    ) -> Result<Self, PairError> {
+        Self::start_as(rig, Default::default(), external, Some(watcher))
     }
 
     fn start_as(
         rig: &Rig,
         config: RobotConfig,
         external: Option<(External, External)>,
+        watcher: Option<Watcher>,
     ) -> Result<Self, PairError> {
         let network = Network::new();
         let clock = HostClock::from_zero();
@@ -271,7 +305,7 @@ impl Pair {
             &robot_identity,
             &trust,
             config,
-            robots,
+            (robots, watcher.clone()),
         )?;
         Ok(Self {
             network,
@@ -280,6 +314,7 @@ impl Pair {
             clock,
             config,
             external,
+            watcher,
             robot_identity,
             operator_identity,
             operators: 0,
@@ -304,7 +339,7 @@ impl Pair {
             identity,
             &self.trust,
             self.config,
-            external,
+            (external, self.watcher.clone()),
         )?;
         Ok(())
     }
