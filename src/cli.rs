@@ -12,7 +12,7 @@ use telemime_endpoint::{HostClock, admin};
 use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
 
 use crate::relay::{Passage, Relay, RelayConfig};
-use crate::{codec, demo, evaluate, ingest, paper, recognise, select, tap, teach};
+use crate::{codec, demo, evaluate, experiment, ingest, paper, recognise, select, tap, teach};
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
 /// network delay behind it.
@@ -58,6 +58,8 @@ enum Command {
     Peers(admin::PeersArgs),
     /// Measure the input's latency from taps on a table.
     Tap(tap::Args),
+    /// A plan's runs: both daemons on a virtual clock, and what they are held against.
+    Experiment(experiment::Args),
     /// A UDP relay that delays, loses and throttles what passes.
     Link(LinkArgs),
     /// Reproduce the tables of the source publication beside ours.
@@ -134,6 +136,7 @@ pub fn main() -> ExitCode {
         Some(Command::Pair(args)) => telemime_operator::cli::pair(args),
         Some(Command::Peers(args)) => admin::peers(args),
         Some(Command::Link(args)) => link(args),
+        Some(Command::Experiment(args)) => experiment::run(args),
         Some(Command::Paper(args)) => paper::run(args),
     };
     match done {

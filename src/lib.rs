@@ -12,6 +12,7 @@ pub mod cli;
 mod codec;
 mod demo;
 mod evaluate;
+mod experiment;
 mod figure;
 pub mod ground;
 mod ingest;

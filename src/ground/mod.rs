@@ -4,5 +4,5 @@
 mod net;
 mod pair;
 
-pub use net::{Network, Socket};
+pub use net::{Network, Passage, Socket};
 pub use pair::{Operator, Pair, PairError, Robot, run_virtual};

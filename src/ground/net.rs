@@ -30,6 +30,22 @@ struct State {
     down: bool,
     sockets: u64,
     tape: Option<Vec<Taped>>,
+    log: Option<Vec<Passage>>,
+}
+
+/// What became of one packet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Passage {
+    /// Who sent it.
+    pub from: SocketAddr,
+    /// Who was to receive it.
+    pub to: SocketAddr,
+    /// When it was sent, on tokio's clock.
+    pub sent: Instant,
+    /// Its length, IP and UDP headers included.
+    pub len_bytes: usize,
+    /// When it arrives; `None` if it does not.
+    pub arrives: Option<Instant>,
 }
 
 /// A packet that somebody on the way has kept.
@@ -59,6 +75,7 @@ impl Network {
             down: false,
             sockets: 0,
             tape: None,
+            log: None,
         })))
     }
 
@@ -97,6 +114,16 @@ impl Network {
         self.state().down = down;
     }
 
+    /// From now on keeps count of every packet that is sent.
+    pub fn log(&self) {
+        self.state().log = Some(Vec::new());
+    }
+
+    /// Every packet sent since [`Network::log`], in order; the count ends.
+    pub fn logged(&self) -> Vec<Passage> {
+        self.state().log.take().unwrap_or_default()
+    }
+
     /// From now on keeps a copy of every packet that is delivered.
     pub fn record(&self) {
         self.state().tape = Some(Vec::new());
@@ -130,13 +157,22 @@ impl Network {
             Some(link) => link.send(now_ns, len),
             None => Fate::Deliver { at_ns: now_ns },
         };
-        let Fate::Deliver { at_ns } = fate else {
-            return;
+        let at = match fate {
+            Fate::Deliver { at_ns } if !state.down => {
+                Some(state.epoch + Duration::from_nanos(at_ns.max(0) as u64))
+            }
+            _ => None,
         };
-        if state.down {
-            return;
+        if let Some(log) = &mut state.log {
+            log.push(Passage {
+                from,
+                to,
+                sent: Instant::now(),
+                len_bytes: len,
+                arrives: at,
+            });
         }
-        let at = state.epoch + Duration::from_nanos(at_ns.max(0) as u64);
+        let Some(at) = at else { return };
         drop(state);
         let (network, packet) = (self.clone(), packet.to_vec());
         tokio::spawn(async move {
