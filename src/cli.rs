@@ -59,7 +59,9 @@ enum Command {
     /// Measure the input's latency from taps on a table.
     Tap(tap::Args),
     /// A plan's runs: both daemons on a virtual clock, and what they are held against.
-    Experiment(experiment::Args),
+    Experiment(Box<experiment::Args>),
+    /// The results of an experiment as one HTML page.
+    Report(experiment::report::Args),
     /// A UDP relay that delays, loses and throttles what passes.
     Link(LinkArgs),
     /// Reproduce the tables of the source publication beside ours.
@@ -137,6 +139,7 @@ pub fn main() -> ExitCode {
         Some(Command::Peers(args)) => admin::peers(args),
         Some(Command::Link(args)) => link(args),
         Some(Command::Experiment(args)) => experiment::run(args),
+        Some(Command::Report(args)) => experiment::report::run(args),
         Some(Command::Paper(args)) => paper::run(args),
     };
     match done {

@@ -8,6 +8,7 @@ mod judge;
 mod method;
 mod plan;
 mod plans;
+pub(crate) mod report;
 mod row;
 mod run;
 mod store;

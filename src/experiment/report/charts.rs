@@ -293,7 +293,7 @@ fn timeline(view: &View<'_>) -> Option<Chart> {
     let outage = outages
         .filter(|(_, from, to)| to - from < 5.0)
         .max_by(|a, b| (a.2 - a.1).total_cmp(&(b.2 - b.1)));
-    let mut of = |method: &'static str| {
+    let of = |method: &'static str| {
         let groups = view.at("on-model", method, delay, &["outage"]);
         let wanted = |g: &&Group<'_>| match &outage {
             Some((text, ..)) => g.text("outage") == text,

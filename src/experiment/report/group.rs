@@ -62,10 +62,6 @@ impl<'a> Group<'a> {
         of(&self.texts, factor)
     }
 
-    pub(super) fn method(&self) -> Option<Method> {
-        self.text("method").parse().ok()
-    }
-
     /// Of one figure over the runs.
     pub(super) fn figure(&self, name: &str) -> Option<Interval> {
         self.each(|row| row.figures.get(name))

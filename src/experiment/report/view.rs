@@ -5,7 +5,7 @@ use std::path::Path;
 use nalgebra::Vector3;
 
 use super::group::{Group, Others, groups, varying};
-use crate::experiment::factor::{FACTORS, UNUSED, index, link};
+use crate::experiment::factor::{FACTORS, UNUSED, link};
 use crate::experiment::method::Method;
 use crate::experiment::row::Row;
 use crate::experiment::store::series_path;
@@ -162,9 +162,4 @@ pub(super) fn called(method: &str) -> String {
 /// The value of a factor in a group.
 pub(super) fn value<'g>(group: &'g Group<'_>, n: usize) -> &'g str {
     &group.texts[n]
-}
-
-/// The index of the outage factor.
-pub(super) fn outage_index() -> usize {
-    index("outage").expect("a factor")
 }
