@@ -58,7 +58,10 @@ fn the_same_plan_gives_the_same_bytes_on_any_number_of_threads_in_parts_and_inte
     run(&args(&plan, &at("once"), "1/1", 2)).unwrap();
     let once = bytes(&at("once"));
     let names: Vec<&str> = once.iter().map(|(name, _)| name.as_str()).collect();
-    assert!(names.contains(&"results.csv") && names.contains(&"manifest.json"), "{names:?}");
+    assert!(
+        names.contains(&"results.csv") && names.contains(&"manifest.json"),
+        "{names:?}"
+    );
     assert!(!names.contains(&"part.csv"), "{names:?}");
 
     // Again, in two parts.
@@ -83,13 +86,19 @@ fn the_same_plan_gives_the_same_bytes_on_any_number_of_threads_in_parts_and_inte
     std::fs::write(at("cut").join("part.csv"), &part).unwrap();
     std::fs::create_dir_all(at("cut").join("series")).unwrap();
     run(&args(&plan, &at("cut"), "1/1", 2)).unwrap();
-    assert!(bytes(&at("cut")) == once, "gone on with, it is another result");
+    assert!(
+        bytes(&at("cut")) == once,
+        "gone on with, it is another result"
+    );
 
     // A line that is none is not gone on with, and another plan overwrites nothing.
     std::fs::remove_file(at("cut").join(store::RESULTS)).unwrap();
     std::fs::write(at("cut").join("part.csv"), [lines[1], "1,2,3\n"].concat()).unwrap();
     let refused = run(&args(&plan, &at("cut"), "1/1", 1)).unwrap_err();
-    assert!(refused.to_string().contains("part.csv:2: not a result"), "{refused}");
+    assert!(
+        refused.to_string().contains("part.csv:2: not a result"),
+        "{refused}"
+    );
     let other = at("other.toml");
     std::fs::write(&other, PLAN.replace("seed = 3", "seed = 4")).unwrap();
     let refused = run(&args(&other, &at("once"), "1/1", 1)).unwrap_err();
@@ -115,10 +124,17 @@ fn the_same_plan_gives_the_same_bytes_on_any_number_of_threads_in_parts_and_inte
     assert!(rmse("hold", "delay 40ms") < rmse("hold", "delay 80ms"));
     let held = of("hold", "delay 80ms");
     assert!((held.delay_p50_s.unwrap() - 0.08).abs() < 3e-3);
-    let stopped: Vec<_> = rows.iter().filter(|r| r.outcome.starts_with("stopped")).collect();
+    let stopped: Vec<_> = rows
+        .iter()
+        .filter(|r| r.outcome.starts_with("stopped"))
+        .collect();
     assert_eq!(stopped.len(), 2);
     // One message may have been on its way; the lease is 0.65 s, and stopping takes a moment.
-    assert!(stopped.iter().all(|r| (0.4..1.6).contains(&r.figures.stop_s.unwrap())));
+    assert!(
+        stopped
+            .iter()
+            .all(|r| (0.4..1.6).contains(&r.figures.stop_s.unwrap()))
+    );
 
     // The report, twice.
     let page = |out: &Path| {
@@ -134,15 +150,28 @@ fn the_same_plan_gives_the_same_bytes_on_any_number_of_threads_in_parts_and_inte
         assert!(!names.contains(fetched), "{fetched}");
     }
     assert!(html.contains("<h1>A &amp; B</h1>") && !html.contains("NaN"));
-    for chart in ["delay-on-model", "delay-off-model", "lag", "age", "timeline", "calibration"] {
-        assert!(html.contains(&format!("<figure id=\"{chart}\">")), "{chart}");
+    for chart in [
+        "delay-on-model",
+        "delay-off-model",
+        "lag",
+        "age",
+        "timeline",
+        "calibration",
+    ] {
+        assert!(
+            html.contains(&format!("<figure id=\"{chart}\">")),
+            "{chart}"
+        );
         for ending in ["svg", "png", "csv"] {
             let path = at("a").join(chart).with_extension(ending);
             assert!(path.exists(), "{}", path.display());
         }
     }
     let unfinished = report::write(&at("cut"), &at("x.html"), None).unwrap_err();
-    assert!(unfinished.to_string().contains("not finished"), "{unfinished}");
+    assert!(
+        unfinished.to_string().contains("not finished"),
+        "{unfinished}"
+    );
 }
 
 #[test]

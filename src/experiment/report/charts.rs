@@ -83,7 +83,12 @@ fn by_delay(view: &View<'_>, (motion, words): (&str, &str)) -> Option<Chart> {
     }
     let ms = |g: &Group<'_>| delay_s(g).map(|s| s * 1e3);
     let ends = view.delays();
-    let layers = over(view, motion, ms, (ends[0] * 1e3, ends[ends.len() - 1] * 1e3));
+    let layers = over(
+        view,
+        motion,
+        ms,
+        (ends[0] * 1e3, ends[ends.len() - 1] * 1e3),
+    );
     let name = if motion == "on-model" {
         "delay-on-model"
     } else {
@@ -118,7 +123,9 @@ fn by_rate(view: &View<'_>, (motion, words): (&str, &str)) -> Option<Chart> {
     for layer in &mut layers {
         match &mut layer.shape {
             Shape::Line(p) | Shape::Dashed(p) => p.iter_mut().for_each(|p| p.1 = p.1.log2()),
-            Shape::Band(p) => p.iter_mut().for_each(|p| (p.1, p.2) = (p.1.log2(), p.2.log2())),
+            Shape::Band(p) => p
+                .iter_mut()
+                .for_each(|p| (p.1, p.2) = (p.1.log2(), p.2.log2())),
             _ => {}
         }
     }
@@ -185,7 +192,7 @@ fn rate_distortion(view: &View<'_>) -> Option<Chart> {
         let point = |g: &Group<'_>| {
             let up = g.figure("up_bytes_per_s")?.mean * 8e-3;
             let rmse = g.figure("rmse_m")?.mean * 1e3;
-            (up > 0.0 && rmse > 0.0).then(|| (up.log2(), rmse.log2()))
+            (up > 0.0 && rmse > 0.0).then_some((up, rmse))
         };
         let groups = view.at("on-model", method, delay, &free);
         let fits = groups.filter(|g| rate_bit_s(g).is_none());
@@ -197,31 +204,59 @@ fn rate_distortion(view: &View<'_>) -> Option<Chart> {
         if points.len() > 1 {
             lines.push(Layer::new("", colour(method), Shape::Thin(points.clone())));
         }
-        dots.push(Layer::new(called(method), colour(method), Shape::Dots(points)));
+        dots.push(Layer::new(
+            called(method),
+            colour(method),
+            Shape::Dots(points),
+        ));
     }
     if dots.len() < 2 {
         return None;
     }
     lines.extend(dots);
+    let all = || lines.iter().flat_map(|layer| points_of(layer).iter().copied());
+    let widest = |of: fn((f64, f64)) -> f64| {
+        let values = all().map(of);
+        let (low, high) = values.fold((f64::MAX, 0.0), |(l, h), v| (v.min(l), v.max(h)));
+        high / low
+    };
+    // Doubling axes name powers of two only: they need a few of them.
+    let doubling = widest(|p| p.0).max(widest(|p| p.1)) > 8.0;
+    if doubling {
+        for layer in &mut lines {
+            if let Shape::Thin(p) | Shape::Dots(p) = &mut layer.shape {
+                p.iter_mut().for_each(|p| *p = (p.0.log2(), p.1.log2()));
+            }
+        }
+    }
     let mut panel = panel(
         &format!("What an error costs, {:.0} ms one way", delay? * 1e3),
         "operator to robot / kbit/s, all headers",
         "tracking error / mm",
         lines,
     )?;
-    panel.doubling = true;
+    panel.doubling = doubling;
     Some(Chart {
         name: "rate-distortion",
-        caption: "Tracking error over what goes from operator to robot, with every header, acknowledgement and clock exchange of ours; both axes double. Left and low is better.".into(),
+        caption: "Tracking error over what goes from operator to robot, with every header, acknowledgement and clock exchange of ours. Left and low is better.".into(),
         panel,
     })
+}
+
+fn points_of(layer: &Layer) -> &[(f64, f64)] {
+    match &layer.shape {
+        Shape::Thin(points) | Shape::Dots(points) => points,
+        _ => &[],
+    }
 }
 
 fn lags(view: &View<'_>) -> Option<Chart> {
     let delay = view.shown_delay_s();
     let mut layers = Vec::new();
     for method in view.methods() {
-        let rows = view.at("on-model", method, delay, &[]).flat_map(|g| &g.rows);
+        let rows = view
+            .at("on-model", method, delay, &[])
+            .flat_map(|g| &g.rows);
         let lags = rows.filter_map(|row| Some(row.figures.lag_s? * 1e3));
         layers.extend(cdf(method, lags.collect()));
     }
@@ -299,7 +334,10 @@ fn timeline(view: &View<'_>) -> Option<Chart> {
             Some((text, ..)) => g.text("outage") == text,
             None => true,
         };
-        groups.into_iter().filter(wanted).find_map(|g| view.course(g))
+        groups
+            .into_iter()
+            .filter(wanted)
+            .find_map(|g| view.course(g))
     };
     let (ours, hold) = (of("ours")?, of("hold"));
     let middle = ours[ours.len() / 2].0;
@@ -319,9 +357,23 @@ fn timeline(view: &View<'_>) -> Option<Chart> {
     };
     let mut layers = Vec::new();
     let lines = [
-        Some(Layer::new("hand", BLACK, Shape::Dashed(along(&ours, false)))),
-        hold.map(|hold| Layer::new(called("hold"), colour("hold"), Shape::Line(along(&hold, true)))),
-        Some(Layer::new(called("ours"), colour("ours"), Shape::Line(along(&ours, true)))),
+        Some(Layer::new(
+            "hand",
+            BLACK,
+            Shape::Dashed(along(&ours, false)),
+        )),
+        hold.map(|hold| {
+            Layer::new(
+                called("hold"),
+                colour("hold"),
+                Shape::Line(along(&hold, true)),
+            )
+        }),
+        Some(Layer::new(
+            called("ours"),
+            colour("ours"),
+            Shape::Line(along(&ours, true)),
+        )),
     ];
     let lines: Vec<Layer> = lines.into_iter().flatten().collect();
     if let Some((_, from, to)) = &outage {
@@ -366,11 +418,17 @@ fn horizons(view: &View<'_>) -> Option<Chart> {
     let mut layers = Vec::new();
     for method in view.methods() {
         let groups: Vec<_> = view.at("on-model", method, delay, &[]).collect();
-        let Some(group) = groups.first() else { continue };
+        let Some(group) = groups.first() else {
+            continue;
+        };
         let at = |(ms, name, _): (f64, &str, &str)| Some((ms, group.figure(name)?.mean * 1e3));
         let points: Vec<_> = AHEAD.into_iter().filter_map(at).collect();
         if !points.is_empty() {
-            layers.push(Layer::new(called(method), colour(method), Shape::Line(points)));
+            layers.push(Layer::new(
+                called(method),
+                colour(method),
+                Shape::Line(points),
+            ));
         }
     }
     Some(Chart {
@@ -394,15 +452,19 @@ fn calibration(view: &View<'_>) -> Option<Chart> {
     )];
     for ((motion, words), colour) in MOTIONS.into_iter().zip([colour("ours"), GREY]) {
         let groups: Vec<_> = view.at(motion, "ours", delay, &[]).collect();
-        let Some(group) = groups.first() else { continue };
-        let points = AHEAD.into_iter().filter_map(|(ms, _, name)| {
-            Some((ms, group.figure(name)?))
-        });
+        let Some(group) = groups.first() else {
+            continue;
+        };
+        let points = AHEAD
+            .into_iter()
+            .filter_map(|(ms, _, name)| Some((ms, group.figure(name)?)));
         let points: Vec<_> = points.collect();
         if points.is_empty() {
             continue;
         }
-        let band = points.iter().map(|(ms, i)| (*ms, i.low * 100.0, i.high * 100.0));
+        let band = points
+            .iter()
+            .map(|(ms, i)| (*ms, i.low * 100.0, i.high * 100.0));
         layers.push(Layer::new("", colour, Shape::Band(band.collect())));
         let line = points.iter().map(|(ms, i)| (*ms, i.mean * 100.0)).collect();
         layers.push(Layer::new(words, colour, Shape::Line(line)));
@@ -410,7 +472,9 @@ fn calibration(view: &View<'_>) -> Option<Chart> {
     (layers.len() > 1).then_some(())?;
     Some(Chart {
         name: "calibration",
-        caption: "Of what came, the share within the region that the predictor said would hold 90 %.".into(),
+        caption:
+            "Of what came, the share within the region that the predictor said would hold 90 %."
+                .into(),
         panel: panel(
             "Calibration of Telemime's 90 % region",
             "ahead / ms",

@@ -104,52 +104,54 @@ fn tiles(view: &View<'_>) -> String {
         link * 1e3,
         escape(ours.text("up"))
     );
-    let mut tile = |value: Option<String>, label: &str| {
-        if let Some(value) = value {
-            let _ = writeln!(out, "<div><b>{value}</b><span>{label}</span></div>");
+    let mut tile = |found: Option<Interval>,
+                    (unit, decimals, name): (f64, usize, &str),
+                    label: &str| {
+        if let Some(found) = found {
+            let (mean, span) = texts(found, unit, decimals);
+            let span = span.map_or_else(String::new, |span| format!(" <i>{span}</i>"));
+            let _ = writeln!(
+                out,
+                "<div><b>{mean}\u{202f}<small>{name}</small></b>{span}<span>{label}</span></div>"
+            );
         }
     };
-    let mm = |g: Option<&Group<'_>>| g.and_then(|g| g.figure("rmse_m")).map(|i| scaled(i, 1e3, 0));
-    tile(mm(Some(ours)).map(|v| v + " mm"), "tracking error, Telemime");
-    tile(
-        mm(first(motion, "hold")).map(|v| v + " mm"),
-        "the same arm, raw samples held",
-    );
-    tile(
-        mm(first(motion, "floor")).map(|v| v + " mm"),
-        "the same arm, no network at all",
-    );
+    let error = |g: Option<&Group<'_>>| g.and_then(|g| g.figure("rmse_m"));
+    let mm = (1e3, 0, "mm");
+    tile(error(Some(ours)), mm, "tracking error, Telemime");
+    let (hold, floor) = (first(motion, "hold"), first(motion, "floor"));
+    tile(error(hold), mm, "the same arm, raw samples held");
+    tile(error(floor), mm, "the same arm, no network at all");
     let hidden = ours.each(|row| view.others.hidden(row));
-    tile(
-        hidden.map(|i| scaled(i, 100.0, 0) + " %"),
-        "of the delay’s cost hidden",
-    );
-    let lag = ours.figure("lag_s");
-    tile(lag.map(|i| scaled(i, 1e3, 0) + " ms"), "effective lag");
+    tile(hidden, (100.0, 0, "%"), "of the delay’s cost hidden");
+    tile(ours.figure("lag_s"), (1e3, 0, "ms"), "effective lag");
     let up = ours.figure("up_bytes_per_s");
-    tile(
-        up.map(|i| scaled(i, 8e-3, 1) + " kbit/s"),
-        "operator to robot, all headers",
-    );
+    tile(up, (8e-3, 1, "kbit/s"), "operator to robot, all headers");
     out + "</div>\n</section>\n"
 }
 
-/// A mean and its interval.
-fn scaled(i: Interval, unit: f64, decimals: usize) -> String {
+/// A mean, and its interval where there is one.
+fn texts(i: Interval, unit: f64, decimals: usize) -> (String, Option<String>) {
     let number = |v: f64| {
         let text = format!("{:.decimals$}", v * unit);
-        let zero = text.trim_start_matches(['-', '0', '.']).is_empty();
         match text.strip_prefix('-') {
-            Some(digits) if zero => digits.to_owned(),
+            Some(digits) if digits.trim_matches(['0', '.']).is_empty() => digits.to_owned(),
             Some(digits) => format!("\u{2212}{digits}"),
             None => text,
         }
     };
     let (mean, low, high) = (number(i.mean), number(i.low), number(i.high));
-    if low == high {
-        mean
-    } else {
-        format!("{mean} <i>{low}\u{2009}…\u{2009}{high}</i>")
+    (
+        mean,
+        (low != high).then(|| format!("{low}\u{2009}…\u{2009}{high}")),
+    )
+}
+
+/// The same in a table.
+fn scaled(i: Interval, unit: f64, decimals: usize) -> String {
+    match texts(i, unit, decimals) {
+        (mean, None) => mean,
+        (mean, Some(span)) => format!("{mean} <i>{span}</i>"),
     }
 }
 
@@ -172,16 +174,26 @@ const COLUMNS: [(&str, &str, f64, usize); 14] = [
 ];
 
 fn tables(view: &View<'_>) -> String {
-    let mut out = String::from("<section>\n<h2>Every setting</h2>\n<p>Means over people and link seeds, with 95 % intervals of a bootstrap over people. <em>Hidden</em> is (E<sub>held</sub> − E)/(E<sub>held</sub> − E<sub>floor</sub>), run by run.</p>\n");
+    let mut out = String::from(
+        "<section>\n<h2>Every setting</h2>\n<p>Means over people and link seeds, with 95 % intervals of a bootstrap over people. <em>Hidden</em> is (E<sub>held</sub> − E)/(E<sub>held</sub> − E<sub>floor</sub>), run by run.</p>\n",
+    );
     for (motion, words) in [
         ("on-model", "Demonstrated motion"),
         ("off-model", "Motion never demonstrated"),
     ] {
-        let groups: Vec<_> = view.groups.iter().filter(|g| g.text("motion") == motion).collect();
+        let groups: Vec<_> = view
+            .groups
+            .iter()
+            .filter(|g| g.text("motion") == motion)
+            .collect();
         if groups.is_empty() {
             continue;
         }
-        let open = if groups.len() <= OPEN_ROWS { " open" } else { "" };
+        let open = if groups.len() <= OPEN_ROWS {
+            " open"
+        } else {
+            ""
+        };
         let _ = write!(
             out,
             "<details{open}>\n<summary>{words}: {}</summary>\n<div class=\"scroll\">\n{}</div>\n</details>\n",
@@ -210,7 +222,7 @@ fn table(view: &View<'_>, groups: &[&Group<'_>]) -> String {
     for n in &varying {
         let name = FACTORS[*n].name;
         let name = if same && name == "up" { "link" } else { name };
-        let _ = write!(out, "<th>{}</th>", name.replace('_', " "));
+        let _ = write!(out, "<th class=\"text\">{}</th>", name.replace('_', " "));
     }
     out += "<th>runs</th><th>hidden / %</th><th>of held</th>";
     for (heading, ..) in &columns {
@@ -219,7 +231,11 @@ fn table(view: &View<'_>, groups: &[&Group<'_>]) -> String {
     out += "</tr></thead>\n<tbody>\n";
     for group in groups {
         let method = group.text("method");
-        let class = if method == "ours" { " class=\"ours\"" } else { "" };
+        let class = if method == "ours" {
+            " class=\"ours\""
+        } else {
+            ""
+        };
         let _ = write!(out, "<tr{class}><th>{}</th>", escape(&called(method)));
         for n in &varying {
             let text = value(group, *n);
@@ -261,7 +277,9 @@ fn notes(view: &View<'_>) -> String {
         notes.push("Motion never demonstrated: of generated hands, a wave turned into a chop, by somebody else; of recordings, another gesture of the same person where there is one.".to_owned());
     }
     let undriven = view.groups.iter().flat_map(|g| &g.rows);
-    let undriven = undriven.filter(|r| r.outcome.starts_with("not driven")).count();
+    let undriven = undriven
+        .filter(|r| r.outcome.starts_with("not driven"))
+        .count();
     if undriven > 0 {
         notes.push(format!(
             "In {} the arm never engaged; their errors are blank, not zero.",
