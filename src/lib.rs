@@ -16,6 +16,7 @@ mod experiment;
 mod figure;
 pub mod ground;
 mod ingest;
+mod link;
 pub mod measure;
 mod paper;
 mod picture;

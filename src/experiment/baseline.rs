@@ -5,7 +5,7 @@ use telemime_operator::cli::Axes;
 use telemime_operator::session::{GO_S, default_scale};
 use telemime_robot::rig::Rig;
 use telemime_robot::servo::Mapping;
-use telemime_sim::link::{Fate, Link};
+use telemime_sim::link::Link;
 
 use super::drive::{driven, from_zero};
 use super::factor::Settings;
@@ -36,8 +36,8 @@ impl Path<'_> {
         let now_ns = ((at_s + REST_S) * 1e9).round() as i64;
         let fate = self.link.send(now_ns, bytes);
         let cut = |(from_s, to_s)| (from_s..to_s).contains(&at_s);
-        let arrived_s = match fate {
-            Fate::Deliver { at_ns } if !self.settings.outage_s.is_some_and(cut) => {
+        let arrived_s = match fate.arrival_ns() {
+            Some(at_ns) if !self.settings.outage_s.is_some_and(cut) => {
                 Some(at_ns as f64 * 1e-9 - REST_S)
             }
             _ => None,
@@ -77,7 +77,7 @@ pub(super) fn drive(
     };
     let lag_s = rig.lag_s();
     let mut path = Path {
-        link: Link::new(settings.up.clone(), seed),
+        link: Link::new(settings.up.clone(), seed).beginning_at(0),
         settings,
         packets: Vec::new(),
     };

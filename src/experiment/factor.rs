@@ -282,35 +282,12 @@ fn arm(text: &str, folder: &Path) -> Result<Option<PathBuf>, String> {
     }
 }
 
-/// A link from netem's words: `delay TIME [JITTER] loss SHARE rate RATE limit PACKETS`, or `perfect`.
-pub(super) fn link(text: &str, _folder: &Path) -> Result<LinkConfig, String> {
-    let mut config = LinkConfig::default();
+/// A link from netem's words, traces looked for beside `folder`; `perfect` is a wire.
+pub(super) fn link(text: &str, folder: &Path) -> Result<LinkConfig, String> {
     if text == "perfect" {
-        return Ok(config);
+        return Ok(LinkConfig::default());
     }
-    let mut words = text.split_whitespace().peekable();
-    while let Some(word) = words.next() {
-        let value = words
-            .next()
-            .ok_or_else(|| format!("`{word}` says nothing"))?;
-        match word {
-            "delay" => {
-                config.delay_s = parse_duration_s(value).map_err(|e| e.to_string())?;
-                if let Some(Ok(jitter_s)) = words.peek().map(|next| parse_duration_s(next)) {
-                    config.jitter_s = jitter_s;
-                    words.next();
-                }
-            }
-            "loss" => config.loss = parse_probability(value).map_err(|e| e.to_string())?,
-            "rate" => {
-                let rate = telemime_sim::link::parse_rate_bit_s(value);
-                config.rate_bit_s = Some(rate.map_err(|e| e.to_string())?);
-            }
-            "limit" => config.limit = value.parse().map_err(|_| "limit: not a number")?,
-            _ => return Err(format!("`{word}` is not a link's setting")),
-        }
-    }
-    Ok(config)
+    LinkConfig::parse_in(text, folder).map_err(|e| e.to_string())
 }
 
 #[cfg(test)]

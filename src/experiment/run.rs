@@ -229,6 +229,16 @@ pub(super) fn inputs(
             inputs.insert(short(path), hex(&Sha256::digest(std::fs::read(path)?)));
         }
     }
+    for link in plan
+        .cells
+        .iter()
+        .flat_map(|c| [&c.settings.up, &c.settings.down])
+    {
+        if let Some(trace) = &link.trace {
+            let path = trace.path();
+            inputs.insert(short(path), hex(&Sha256::digest(std::fs::read(path)?)));
+        }
+    }
     if !plan.motion.folders.is_empty() {
         for subject in subjects {
             for d in [&subject.on_model, &subject.off_model] {

@@ -214,7 +214,11 @@ fn rate_distortion(view: &View<'_>) -> Option<Chart> {
         return None;
     }
     lines.extend(dots);
-    let all = || lines.iter().flat_map(|layer| points_of(layer).iter().copied());
+    let all = || {
+        lines
+            .iter()
+            .flat_map(|layer| points_of(layer).iter().copied())
+    };
     let widest = |of: fn((f64, f64)) -> f64| {
         let values = all().map(of);
         let (low, high) = values.fold((f64::MAX, 0.0), |(l, h), v| (v.min(l), v.max(h)));

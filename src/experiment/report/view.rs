@@ -129,7 +129,8 @@ pub(super) fn delay_s(group: &Group<'_>) -> Option<f64> {
 
 /// The rate a group's link is set to, bit/s.
 pub(super) fn rate_bit_s(group: &Group<'_>) -> Option<f64> {
-    link(group.text("up"), Path::new(".")).ok()?.rate_bit_s
+    let rate = link(group.text("up"), Path::new(".")).ok()?.rate?;
+    Some(rate.bit_s as f64)
 }
 
 /// A method's colour, everywhere.
