@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use telemime_operator::session::FutureBound;
-use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability};
+use telemime_sim::link::{LinkConfig, parse_duration_s};
 
 use super::method::Method;
 
