@@ -123,3 +123,18 @@ figures! {
 
 /// The horizons of prediction, s, in the order of the columns.
 pub(super) const HORIZONS_S: [f64; 4] = [1.0 / 30.0, 0.1, 0.2, 0.3];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::experiment::factor::FACTORS;
+
+    #[test]
+    fn every_figure_and_every_factor_is_defined_in_the_document() {
+        let text = include_str!("../../docs/experiments.md");
+        let factors = FACTORS.iter().map(|f| f.name);
+        for name in Figures::NAMES.iter().copied().chain(factors) {
+            assert!(text.contains(&format!("`{name}`")), "{name}");
+        }
+    }
+}

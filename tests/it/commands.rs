@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 18] = [
+const COMMANDS: [&str; 20] = [
     "demo",
     "import",
     "learn",
@@ -20,6 +20,8 @@ const COMMANDS: [&str; 18] = [
     "identity",
     "pair",
     "peers",
+    "experiment",
+    "report",
     "link",
     "tap",
     "paper",
