@@ -13,6 +13,7 @@ pub mod cli;
 mod codec;
 mod demo;
 mod evaluate;
+mod experiment;
 mod figure;
 pub mod ground;
 mod ingest;

@@ -31,6 +31,22 @@ struct State {
     sockets: u64,
     under_way: usize,
     tape: Option<Vec<Taped>>,
+    log: Option<Vec<Passage>>,
+}
+
+/// What became of one packet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Passage {
+    /// Who sent it.
+    pub from: SocketAddr,
+    /// Who was to receive it.
+    pub to: SocketAddr,
+    /// When it was sent, on tokio's clock.
+    pub sent: Instant,
+    /// Its length, IP and UDP headers included.
+    pub len_bytes: usize,
+    /// When it arrives; `None` if it does not.
+    pub arrives: Option<Instant>,
 }
 
 /// A packet that somebody on the way has kept.
@@ -61,6 +77,7 @@ impl Network {
             sockets: 0,
             under_way: 0,
             tape: None,
+            log: None,
         })))
     }
 
@@ -98,6 +115,16 @@ impl Network {
     /// Cuts every link, or restores them. Packets already on their way arrive.
     pub fn set_down(&self, down: bool) {
         self.state().down = down;
+    }
+
+    /// From now on keeps count of every packet that is sent.
+    pub fn log(&self) {
+        self.state().log = Some(Vec::new());
+    }
+
+    /// Every packet sent since [`Network::log`], in order; the count ends.
+    pub fn logged(&self) -> Vec<Passage> {
+        self.state().log.take().unwrap_or_default()
     }
 
     /// From now on keeps a copy of every packet that is delivered.
@@ -145,10 +172,20 @@ impl Network {
             Some(link) => link.send(now_ns, len),
             None => Fate::whole(now_ns),
         };
-        if state.down {
+        let (epoch, down) = (state.epoch, state.down);
+        let at = |ns: i64| epoch + Duration::from_nanos(ns.max(0) as u64);
+        if let Some(log) = &mut state.log {
+            log.push(Passage {
+                from,
+                to,
+                sent: Instant::now(),
+                len_bytes: len,
+                arrives: fate.arrival_ns().filter(|_| !down).map(at),
+            });
+        }
+        if down {
             return;
         }
-        let epoch = state.epoch;
         drop(state);
         for delivery in fate.deliveries() {
             let (network, mut packet) = (self.clone(), packet.to_vec());
@@ -157,7 +194,7 @@ impl Network {
             {
                 continue;
             }
-            let at = epoch + Duration::from_nanos(delivery.at_ns.max(0) as u64);
+            let at = at(delivery.at_ns);
             self.state().under_way += 1;
             tokio::spawn(async move {
                 sleep_until(at).await;

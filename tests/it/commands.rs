@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 19] = [
+const COMMANDS: [&str; 21] = [
     "demo",
     "import",
     "learn",
@@ -21,6 +21,8 @@ const COMMANDS: [&str; 19] = [
     "identity",
     "pair",
     "peers",
+    "experiment",
+    "report",
     "link",
     "tap",
     "paper",
