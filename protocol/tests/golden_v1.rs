@@ -220,17 +220,17 @@ fn operator_datagrams() {
     pinned(vec![
         (
             motion(Some(0xdead_beef), WirePose::default(), knots),
-            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e01fcefbeaddefc0ead2500fbd007fb8713fb50c30301ff \
+            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e01fcefbeaddefc0ead2500fbd007fb8713fb50c3123f01ff \
              02fe03fd28ce3c7f80000000fa045a00c3fe",
         ),
         (
             motion(None, WirePose::default(), KnotBlock::default()),
-            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
+            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28 \
              ce3c7f80000000fa00",
         ),
         (
             motion(None, POSE, KnotBlock::default()),
-            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
+            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28 \
              ce3c7f800001fb204efb6ff500140a010203fffefd7f8000050607ff90c81e14963c2864501e0164fa00",
         ),
         (go(None), "010103fbfb00fc0ead2500fb8a0200"),
@@ -255,7 +255,7 @@ fn operator_datagrams() {
                     weight: [127, -64, 0, 64, 1, 100],
                 }),
             })),
-            "010103fbfb00fc0ead2500fb8a0201fcc0c62d008000000001fc0ead2500fbd007fb8713fb50c303 \
+            "010103fbfb00fc0ead2500fb8a0201fcc0c62d008000000001fc0ead2500fbd007fb8713fb50c3123f \
              01ff02fe03fd28ce3c7f8000ff807fc000400164",
         ),
         (
