@@ -50,7 +50,7 @@ pub(super) const WAYS: [&str; 5] = [
     "delayed, ideal tip",
     "delayed, same arm",
     "guarded, same arm",
-    "known once begun, same arm",
+    "once begun, same arm",
     "known ahead, same arm",
 ];
 
