@@ -8,7 +8,7 @@ use telemime_protocol::predict::BAND_KNOTS;
 fn trust(watched: usize) -> (Vec<u8>, Vec<Vec<u8>>) {
     let config = SessionConfig {
         future_bound: FutureBound::Absolute(0.0),
-        max_silence_s: 0.0,
+        max_silence_s: 0.03,
         ..SessionConfig::default()
     };
     let mut bench = Bench::ready(config, Some(example(2, 24)));
