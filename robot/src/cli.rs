@@ -96,7 +96,7 @@ pub struct Args {
     /// The arm obeys this much late, 0 to 50ms; the prediction makes up for it [default: 0ms].
     #[arg(long, value_name = "TIME", value_parser = parse_duration_s)]
     pub dead_time: Option<f64>,
-    /// Bandwidth of the filter between prediction and arm, rad/s: less is smoother, and farther behind [default: 45].
+    /// Bandwidth of the filter between prediction and arm, rad/s: less is smoother, and farther behind [default: 40].
     #[arg(long, value_name = "RAD_S")]
     pub bandwidth: Option<f64>,
     /// Speak protocol versions up to this one; 2 is an experiment [default: 1].

@@ -18,6 +18,7 @@ mod correcting;
 mod gating;
 mod mirroring;
 mod posing;
+mod resting;
 
 const MS: i64 = 1_000_000;
 const EPOCH: u32 = 17;

@@ -47,7 +47,8 @@ impl Default for ControlConfig {
     /// 1 kHz, and the tip limits of a published arm.
     fn default() -> Self {
         Self {
-            omega: 45.0,
+            // 3/ω is part of the horizon, and ω³ of the jerk: the fastest that is no rougher than the hand itself on recorded gestures.
+            omega: 40.0,
             limits: CartesianLimits {
                 v_max: 1.7,
                 a_max: 13.0,
