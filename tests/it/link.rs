@@ -200,7 +200,7 @@ fn a_recorded_satellite_link_has_its_delays_and_losses() {
             .map(|l| l.split(',').map(|v| v.parse().unwrap()).collect())
             .collect();
         assert_eq!(values, rows.len());
-        // Twenty packets in every step of 100 ms, in the middle of it, so short that no queue builds up.
+        // Twenty packets in every step of 100 ms, in the middle of it, each sent within a millisecond.
         let mut link = Link::new(config, 1).beginning_at(0);
         let (mut lost, mut expected, mut last_ns) = (0, 0.0, i64::MIN);
         for row in &rows {
