@@ -12,8 +12,8 @@ use telemime_robot::control::{
     ControlConfig, ControlError, Controller, home_posture, workspace_radius,
 };
 use telemime_sim::arm::{
-    ArmModel, CapsuleSource, Joint, JointKind, Joints, LoadOptions, Notice, Payload, SelfCollision,
-    Unguarded, default_urdf,
+    ArmModel, CapsuleSource, Joint, JointKind, Joints, LoadOptions, Notice, Payload, Unguarded,
+    default_urdf,
 };
 
 /// Look at an arm's description.
@@ -168,7 +168,7 @@ fn look(arm: ArmModel, given: Option<Joints>, payload: Option<Payload>) -> Repor
     let arm = Arc::new(arm);
     let start = given.unwrap_or_else(|| home_posture(&arm));
     let config = ControlConfig::default();
-    let mut hulls = SelfCollision::new(&arm, &start, config.barrier.stop_m);
+    let mut hulls = config.barrier.hulls(&arm, &start);
     let mut kinematics = telemime_sim::arm::Kinematics::new();
     kinematics.update(&arm, &start);
     hulls.place(&kinematics);
