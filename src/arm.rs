@@ -12,8 +12,8 @@ use telemime_robot::control::{
     ControlConfig, ControlError, Controller, home_posture, workspace_radius,
 };
 use telemime_sim::arm::{
-    ArmModel, CapsuleSource, Joint, JointKind, Joints, LoadOptions, Notice, Payload, SelfCollision,
-    Unguarded, default_urdf,
+    ArmModel, CapsuleSource, Joint, JointKind, Joints, LoadOptions, Notice, Payload, Unguarded,
+    default_urdf,
 };
 
 /// Look at an arm's description.
@@ -168,7 +168,7 @@ fn look(arm: ArmModel, given: Option<Joints>, payload: Option<Payload>) -> Repor
     let arm = Arc::new(arm);
     let start = given.unwrap_or_else(|| home_posture(&arm));
     let config = ControlConfig::default();
-    let mut hulls = SelfCollision::new(&arm, &start, config.barrier.stop_m);
+    let mut hulls = config.barrier.hulls(&arm, &start);
     let mut kinematics = telemime_sim::arm::Kinematics::new();
     kinematics.update(&arm, &start);
     hulls.place(&kinematics);
@@ -209,7 +209,7 @@ fn look(arm: ArmModel, given: Option<Joints>, payload: Option<Payload>) -> Repor
                 radius_m: c.radius_m,
                 from: match c.source {
                     CapsuleSource::Geometry => "shape",
-                    CapsuleSource::Derived => "inertia",
+                    CapsuleSource::Derived => "derived",
                 },
             })
             .collect(),
@@ -277,6 +277,11 @@ fn row(joint: &Joint) -> JointRow {
     }
 }
 
+/// Without the minus sign of what would be printed as zero.
+fn plain(value: f64) -> f64 {
+    if value.abs() < 5e-4 { 0.0 } else { value }
+}
+
 /// The report for people.
 fn told(report: &Report) -> String {
     let mut out = String::new();
@@ -311,7 +316,7 @@ fn write_report(out: &mut String, r: &Report) -> std::fmt::Result {
         value.map_or_else(|| "–".to_owned(), |v| format!("{v:.digits$}"))
     };
     for j in &r.joints {
-        let [x, y, z] = j.centre_m;
+        let [x, y, z] = j.centre_m.map(plain);
         writeln!(
             out,
             "{:wide$}  {:10}  {:>8} {:>8}  {:>6}  {:>7}  {:>7.3}  {:>8.3}  {:>7.3}  {x:.3} {y:.3} {z:.3}",
@@ -329,7 +334,7 @@ fn write_report(out: &mut String, r: &Report) -> std::fmt::Result {
     writeln!(out, "(rad, rad/s, N·m; of slides m, m/s, N)\n")?;
     let wide = r.capsules.iter().map(|c| c.link.chars().count()).max();
     let wide = wide.unwrap_or(0).max("hull of".len());
-    writeln!(out, "{:wide$}  length m  radius m  after", "hull of")?;
+    writeln!(out, "{:wide$}  length m  radius m  from", "hull of")?;
     for c in &r.capsules {
         writeln!(
             out,
@@ -351,8 +356,13 @@ fn write_report(out: &mut String, r: &Report) -> std::fmt::Result {
         let [a, b] = &pair.links;
         writeln!(out, "  {a} and {b}: {}", pair.why)?;
     }
-    let q: Vec<String> = r.start.q.iter().map(|q| format!("{q:.3}")).collect();
-    let [x, y, z] = r.start.tip_m;
+    let q: Vec<String> = r
+        .start
+        .q
+        .iter()
+        .map(|q| format!("{:.3}", plain(*q)))
+        .collect();
+    let [x, y, z] = r.start.tip_m.map(plain);
     writeln!(
         out,
         "\nstart ({}): {}\n  tip at {x:.3} {y:.3} {z:.3} m",

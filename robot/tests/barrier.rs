@@ -7,9 +7,7 @@ use telemime_robot::control::{
     BarrierConfig, ClampCounts, ControlConfig, ControlError, Controller, Demand, Plane,
     home_posture,
 };
-use telemime_sim::arm::{
-    ArmModel, Joints, Kinematics, LoadOptions, Plant, SelfCollision, default_urdf,
-};
+use telemime_sim::arm::{ArmModel, Joints, Kinematics, LoadOptions, Plant, default_urdf};
 
 const DT_S: f64 = 1e-3;
 
@@ -110,7 +108,7 @@ fn attack(seed: u64, minutes: f64, barrier: BarrierConfig, simulated: bool) -> L
     let mut controller = Controller::new(Arc::clone(&arm), &config, &home).unwrap();
     let mut plant = Plant::new(Arc::clone(&arm), &home).unwrap();
     // The pairs that are looked at are those the controller guards.
-    let mut hulls = SelfCollision::new(&arm, &home, BarrierConfig::default().stop_m + 0.01);
+    let mut hulls = BarrierConfig::default().hulls(&arm, &home);
     let mut kinematics = Kinematics::new();
     kinematics.update(&arm, &home);
     let mut adversary = Adversary::new(seed);

@@ -84,6 +84,11 @@ impl Default for BarrierConfig {
 }
 
 impl BarrierConfig {
+    /// The pairs of links that are kept apart, of an arm that starts at `start`: not those that are within 10 mm of the stop distance there, or nearly always.
+    pub fn hulls(&self, arm: &ArmModel, start: &Joints) -> SelfCollision {
+        SelfCollision::new(arm, start, self.stop_m + 2.0 * SOFT_M)
+    }
+
     /// The same with one plane more.
     ///
     /// # Errors
@@ -221,7 +226,7 @@ impl Barrier {
         }
         let mut kinematics = Kinematics::new();
         kinematics.update(&arm, start);
-        let mut hulls = SelfCollision::new(&arm, start, config.stop_m + 2.0 * SOFT_M);
+        let mut hulls = config.hulls(&arm, start);
         hulls.place(&kinematics);
         let mut links = [0_u32; MAX_PLANES];
         for (links, plane) in links.iter_mut().zip(&config.planes) {

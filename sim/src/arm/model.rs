@@ -160,7 +160,7 @@ impl ArmModel {
 
     /// The farthest that the tip is from the first joint's origin in 10 000 sampled postures, m: the same for the same arm.
     pub fn sampled_reach_m(&self) -> f64 {
-        let mut rng = Xoshiro256PlusPlus::seed_from_u64(0x4ea_c4);
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(0x4eac);
         let mut kinematics = Kinematics::new();
         let mut reach = 0.0_f64;
         for _ in 0..10_000 {

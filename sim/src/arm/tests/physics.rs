@@ -70,12 +70,12 @@ fn energy(arm: &ArmModel, plant: &Plant) -> f64 {
 }
 
 /// Falls and swings for `seconds`; the largest change of energy, J, and the share by which the momentum about the vertical changed.
-fn swing(integrator: Integrator, dt_s: f64, seconds: f64) -> (f64, f64) {
+fn swing(dt_s: f64, seconds: f64) -> (f64, f64) {
     let arm = endless();
     let start = of(&[0.0, 0.3, 0.0, -1.5, 0.0, 1.6, 0.0]);
     let mut plant = Plant::new(Arc::clone(&arm), &start)
         .unwrap()
-        .integrated_by(integrator);
+        .integrated_by(Integrator::Rk4);
     let mut kick = Joints::zeros();
     // The first joint turns about the vertical, where gravity has no say.
     kick[0] = 20.0;
@@ -111,12 +111,9 @@ fn swing(integrator: Integrator, dt_s: f64, seconds: f64) -> (f64, f64) {
 
 #[test]
 fn free_motion_keeps_energy_and_the_momentum_about_the_vertical() {
-    let (energy_j, drift) = swing(Integrator::Rk4, 1e-3, 3.0);
+    let (energy_j, drift) = swing(1e-3, 3.0);
     println!("Runge-Kutta: {energy_j:e} J, {drift:e} of the momentum");
     assert!(energy_j < 1e-5 && drift < 1e-5);
-    let (energy_j, drift) = swing(Integrator::SemiImplicit, 1e-3, 3.0);
-    println!("semi-implicit: {energy_j:e} J, {drift:e}");
-    assert!(energy_j < 5.0 && drift < 0.2);
 }
 
 #[test]
