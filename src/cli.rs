@@ -27,6 +27,7 @@ struct Cli {
     demo: demo::Args,
 }
 
+#[expect(clippy::large_enum_variant, reason = "there is one, parsed once")]
 #[derive(Subcommand)]
 enum Command {
     /// Both daemons as two processes over a shaped link, and what became of the delay.

@@ -227,6 +227,20 @@ pub struct Socket {
     id: u64,
 }
 
+impl Drop for Socket {
+    /// What is sent to a socket that is closed piles up nowhere.
+    fn drop(&mut self) {
+        let mut state = self.network.state();
+        if state
+            .inboxes
+            .get(&self.addr)
+            .is_some_and(|i| i.id == self.id)
+        {
+            state.inboxes.remove(&self.addr);
+        }
+    }
+}
+
 impl fmt::Debug for Socket {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "Socket({})", self.addr)

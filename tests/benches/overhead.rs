@@ -13,7 +13,7 @@
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use std::sync::Arc;
 use std::thread;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use nalgebra::Vector3;
 use quinn::crypto::rustls::{QuicClientConfig, QuicServerConfig};
@@ -234,7 +234,8 @@ impl Engaged {
             handle,
             clock,
         };
-        for i in 0..2000 {
+        for i in 0..5000 {
+            thread::sleep(Duration::from_millis(1));
             let now = clock.now();
             let sample = HandSample::at(Stamp(now.0), Vector3::new(0.0, 0.0, 2.0));
             engaged.operator.handle_sample(Stamp(now.0), sample);

@@ -46,6 +46,8 @@ struct Grant {
     until: Mono,
     /// When the newest sample was valid, if a hand is followed.
     valid_at: Option<Mono>,
+    /// None has come since the request, and the first may be of the same sample.
+    fresh: bool,
 }
 
 /// The model of one robot, through its restarts.
@@ -168,6 +170,7 @@ impl Model {
                         ticket,
                         until,
                         valid_at,
+                        fresh: true,
                     });
                 }
                 Told::News(ticket, lease, valid_at) => {
@@ -182,7 +185,10 @@ impl Model {
                     let old = grant.valid_at;
                     grant.until = grant.until.max(lease.until);
                     grant.valid_at = valid_at;
-                    let newer = valid_at.zip(old).is_none_or(|(new, old)| new > old);
+                    let fresh = std::mem::replace(&mut grant.fresh, false);
+                    let newer = valid_at
+                        .zip(old)
+                        .is_none_or(|(new, old)| new > old || fresh && new == old);
                     self.must(newer, at, || {
                         format!("a sample of {valid_at:?} after {old:?}")
                     });
