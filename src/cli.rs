@@ -28,7 +28,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     /// Both daemons as two processes over a shaped link, and what became of the delay.
-    Demo(demo::Args),
+    Demo(Box<demo::Args>),
     /// Make demonstrations of raw recordings: skeletons, or tables of a hand's path.
     Import(Box<ingest::Args>),
     /// Learn a skill from a folder of demonstrations and save it.
