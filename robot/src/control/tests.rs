@@ -3,7 +3,9 @@
 use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
-use telemime_sim::arm::{ArmModel, Joints, Kinematics, LoadOptions, Plant, default_urdf};
+use telemime_sim::arm::{
+    ArmModel, ContactPlane, Joints, Kinematics, LoadOptions, Plant, default_urdf,
+};
 
 use super::*;
 
@@ -654,4 +656,56 @@ fn a_dead_time_of_the_torque_would_need_a_slow_loop() {
     settles(0.01, 40.0);
     settles(0.02, 20.0);
     settles(0.05, 8.0);
+}
+
+#[test]
+fn a_tip_pressed_on_a_surface_stays_on_it_and_comes_off() {
+    let mut rig = rig(&ControlConfig::default());
+    let surface_m = rig.start.z - 0.05;
+    let surface = ContactPlane::new(Vector3::z(), surface_m).unwrap();
+    rig.plant = rig.plant.clone().beside(Some(surface));
+    let into = rig.start + Vector3::new(0.02, 0.03, -0.08);
+    let (mut deepest, mut hardest_n) = (0.0_f64, 0.0_f64);
+    for _ in 0..3000 {
+        let out = rig.follow(into);
+        deepest = deepest.max(surface_m - out.tip.z);
+        hardest_n = hardest_n.max(rig.plant.contact_force().norm());
+    }
+    println!(
+        "pressed: {:.2} mm deep, {hardest_n:.0} N at most, {:.0} N at the end",
+        deepest * 1e3,
+        rig.plant.contact_force().z
+    );
+    assert!(rig.plant.contact_force().z > 10.0 && hardest_n < 1000.0);
+    assert!(deepest < 0.04 && rig.plant.qd().amax() < 0.01);
+    let mut tip = Vector3::zeros();
+    for _ in 0..2000 {
+        tip = rig.follow(rig.start).tip;
+    }
+    assert!((tip - rig.start).norm() < 1e-3, "{tip}");
+    assert_eq!(rig.plant.contact_force(), Vector3::zeros());
+}
+
+#[test]
+fn a_payload_that_is_known_is_carried_and_one_too_heavy_refused() {
+    let with = |payload: &str| {
+        let options = LoadOptions {
+            payload: Some(payload.parse().unwrap()),
+            ..LoadOptions::default()
+        };
+        let arm = Arc::new(ArmModel::from_urdf(default_urdf(), &options).unwrap());
+        let home = home_posture(&arm);
+        Controller::new(Arc::clone(&arm), &ControlConfig::default(), &home)
+            .map(|controller| (controller, Plant::new(arm, &home).unwrap(), home))
+    };
+    let (mut controller, mut plant, home) = with("1.5@0,0,0.05").unwrap();
+    for _ in 0..1000 {
+        let out = controller.tick(Demand::Stop, plant.q(), plant.qd());
+        plant.step(&out.tau, DT);
+    }
+    assert!((plant.q() - home).norm() < 1e-5);
+    let bare = *rig(&ControlConfig::default()).controller.limits();
+    assert!(controller.limits().a_max < bare.a_max);
+    let error = with("30").unwrap_err();
+    assert!(matches!(error, ControlError::TooWeak { .. }), "{error}");
 }
