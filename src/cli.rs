@@ -12,7 +12,7 @@ use telemime_endpoint::{HostClock, admin};
 use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
 
 use crate::relay::{Passage, Relay, RelayConfig};
-use crate::{codec, demo, evaluate, ingest, paper, recognise, select, tap, teach};
+use crate::{codec, demo, evaluate, ingest, paper, recognise, replay, select, tap, teach};
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
 /// network delay behind it.
@@ -53,6 +53,8 @@ enum Command {
     Operator(Box<telemime_operator::cli::Args>),
     /// The robot daemon: an arm that follows.
     Robot(telemime_robot::cli::Args),
+    /// Run a robot's black box again, and tell what happened.
+    Replay(replay::Args),
     Identity(admin::IdentityArgs),
     Pair(telemime_operator::cli::PairArgs),
     Peers(admin::PeersArgs),
@@ -130,6 +132,7 @@ pub fn main() -> ExitCode {
         Some(Command::Tap(args)) => tap::run(args),
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),
+        Some(Command::Replay(args)) => replay::run(args),
         Some(Command::Identity(args)) => admin::identity(args, Role::Operator),
         Some(Command::Pair(args)) => telemime_operator::cli::pair(args),
         Some(Command::Peers(args)) => admin::peers(args),

@@ -21,6 +21,7 @@ use telemime_operator::session::SessionConfig;
 use telemime_operator::task::Task;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
+use telemime_robot::blackbox::{Due, Header, Recorder, SPAN_S, taps};
 use telemime_robot::daemon::{Daemon as RobotDaemon, Notice as RobotNotice};
 use telemime_robot::desk::Desk;
 use telemime_robot::rig::Rig;
@@ -91,6 +92,7 @@ pub struct Pair {
 pub struct Robot {
     reports: Rc<RefCell<Vec<Report>>>,
     notices: Rc<RefCell<Vec<RobotNotice>>>,
+    records: Rc<RefCell<Vec<(Due, Vec<u8>)>>>,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
     tasks: Rc<[tokio::task::AbortHandle; 2]>,
@@ -113,21 +115,36 @@ impl Robot {
     fn start(
         network: &Network,
         clock: HostClock,
-        rig: &Rig,
+        (rig, recorded): (&Rig, bool),
         identity: &Identity,
         trust: &Trust,
         config: RobotConfig,
         external: Option<External>,
     ) -> Result<Self, PairError> {
         let (rings, handle) = servo::rings();
-        let mut core = rig.servo(rings);
-        let period = Duration::from_secs_f64(core.tick_s());
+        let mut station = rig.servo(rings);
+        let mut recorder = None;
+        if recorded {
+            let (tap, feed) = taps(&station.room());
+            station = station.recorded(tap);
+            recorder = Some(Recorder::new(Header::new(rig, None), feed, SPAN_S));
+        }
+        let records: Rc<RefCell<Vec<_>>> = Rc::default();
+        let kept = records.clone();
+        let period = Duration::from_secs_f64(station.tick_s());
         let servo = tokio::task::spawn_local(async move {
             let mut tick = interval(period);
             tick.set_missed_tick_behavior(MissedTickBehavior::Burst);
             loop {
                 tick.tick().await;
-                core.tick(clock.now());
+                let report = station.tick(clock.now());
+                // As often as the thread does it that a robot has for this.
+                if let Some(recorder) = recorder.as_mut().filter(|_| report.tick % 50 == 0)
+                    && let Some(due) = recorder.drain()
+                    && let Some(bytes) = recorder.bytes(due)
+                {
+                    kept.borrow_mut().push((due, bytes));
+                }
             }
         });
         let socket = quic::Socket::Abstract {
@@ -149,6 +166,7 @@ impl Robot {
         let robot = Self {
             reports: Rc::default(),
             notices: Rc::default(),
+            records,
             quit,
             words,
             tasks: Rc::new([servo.abort_handle(), serving.abort_handle()]),
@@ -174,6 +192,11 @@ impl Robot {
     /// Every tick so far.
     pub fn reports(&self) -> std::cell::Ref<'_, Vec<Report>> {
         self.reports.borrow()
+    }
+
+    /// What its black box has written so far, if the pair was [started with one](Pair::start_recorded).
+    pub fn records(&self) -> std::cell::Ref<'_, Vec<(Due, Vec<u8>)>> {
+        self.records.borrow()
     }
 
     /// Everything else it noticed so far.
@@ -238,7 +261,15 @@ impl Pair {
     /// # Errors
     /// [`PairError`].
     pub fn start_with(rig: &Rig, config: RobotConfig) -> Result<Self, PairError> {
-        Self::start_as(rig, config, None)
+        Self::start_as((rig, false), config, None)
+    }
+
+    /// As [`Pair::start`], with a black box at the robot.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn start_recorded(rig: &Rig) -> Result<Self, PairError> {
+        Self::start_as((rig, true), Default::default(), None)
     }
 
     /// As [`Pair::start`], with disciplined clocks at the robot and at the operators.
@@ -250,11 +281,11 @@ impl Pair {
         robot: External,
         operators: External,
     ) -> Result<Self, PairError> {
-        Self::start_as(rig, Default::default(), Some((robot, operators)))
+        Self::start_as((rig, false), Default::default(), Some((robot, operators)))
     }
 
     fn start_as(
-        rig: &Rig,
+        rig: (&Rig, bool),
         config: RobotConfig,
         external: Option<(External, External)>,
     ) -> Result<Self, PairError> {
@@ -300,7 +331,7 @@ impl Pair {
         self.robot = Robot::start(
             network,
             clock,
-            rig,
+            (rig, false),
             identity,
             &self.trust,
             self.config,

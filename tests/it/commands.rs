@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 18] = [
+const COMMANDS: [&str; 19] = [
     "demo",
     "import",
     "learn",
@@ -16,6 +16,7 @@ const COMMANDS: [&str; 18] = [
     "evaluate",
     "codec",
     "robot",
+    "replay",
     "operator",
     "identity",
     "pair",

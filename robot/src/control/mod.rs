@@ -14,7 +14,8 @@ mod turn;
 mod tests;
 
 pub use controller::{
-    ClampCounts, Clamps, ControlConfig, ControlError, Controller, Demand, Output,
+    ClampCounts, Clamps, ControlConfig, ControlError, Controller, ControllerState, Demand,
+    ForeignState, Output,
 };
 pub use filter::{FilterConfig, FilterError, FilterState, LimitedFilter};
 pub use ik::{IkConfig, JointReference, JointStep};
