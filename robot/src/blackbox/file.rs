@@ -242,7 +242,7 @@ pub fn write(dir: &Path, due: Due, bytes: &[u8]) -> Result<PathBuf, WriteError> 
 
 /// One more than the highest number in front of a record's name.
 fn next_number(dir: &Path) -> std::io::Result<u32> {
-    let mut highest = 0;
+    let mut highest = 0_u32;
     for entry in std::fs::read_dir(dir)? {
         let name = entry?.file_name();
         let name = name.to_string_lossy();

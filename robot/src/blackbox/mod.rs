@@ -15,7 +15,7 @@ mod tests;
 
 pub use file::{BlackBox, Header, ReadError, WriteError};
 pub use recorder::{Due, Feed, Recorder};
-pub use replay::{Difference, Moment, Replay, ReplayError, Row};
+pub use self::replay::{Difference, Moment, Replay, ReplayError, Row, replay};
 pub use tap::{Tap, Ticked, taps};
 pub use thread::{Asker, Keeper, Saved};
 
