@@ -293,8 +293,10 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     };
     let keeper = match args.black_box.clone().or(file.black_box) {
         Some(dir) => {
+            // Better now than after the stop that it was for.
             std::fs::create_dir_all(&dir)
-                .with_context(|| format!("--black-box {}", dir.display()))?;
+                .and_then(|()| tempfile::tempfile_in(&dir))
+                .with_context(|| format!("--black-box {} cannot be written", dir.display()))?;
             let (tap, feed) = taps(&station.room());
             station = station.recorded(tap);
             let recorder = Recorder::new(Header::new(&rig, driver.clone()), feed, SPAN_S);

@@ -29,7 +29,7 @@ const MAX_LINE: usize = 256;
 /// Largest header, bytes: an URDF is in it.
 const MAX_HEADER: usize = 16 << 20;
 /// Largest chunk, bytes.
-const MAX_CHUNK: usize = 16 << 20;
+const MAX_CHUNK: usize = 64 << 20;
 
 /// The circumstances of a record: all that a replay needs besides the ticks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

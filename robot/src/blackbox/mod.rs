@@ -13,9 +13,9 @@ mod ticks;
 #[cfg(test)]
 mod tests;
 
+pub use self::replay::{Difference, Moment, Replay, ReplayError, Row, replay};
 pub use file::{BlackBox, Header, ReadError, WriteError};
 pub use recorder::{Due, Feed, Recorder};
-pub use self::replay::{Difference, Moment, Replay, ReplayError, Row, replay};
 pub use tap::{Tap, Ticked, taps};
 pub use thread::{Asker, Keeper, Saved};
 

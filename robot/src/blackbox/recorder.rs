@@ -14,6 +14,9 @@ use crate::servo::{ArmFault, CoreState, Order};
 /// After a stop this much more is recorded if the arm does not come to rest before, ticks.
 const AFTERMATH_TICKS: u64 = 2000;
 
+/// No more than this is kept, bytes: two minutes take a quarter of it, unless somebody floods.
+const MAX_BYTES: usize = 128 << 20;
+
 /// What a [`Recorder`] is fed through.
 #[derive(Debug)]
 pub struct Feed(pub(super) Taps);
@@ -196,10 +199,13 @@ impl Recorder {
         }
         self.kept.push_back(self.keep(&chunk));
         let mut held: u64 = self.kept.iter().map(|kept| kept.ticks).sum();
-        while let Some(oldest) = self.kept.front()
-            && held - oldest.ticks >= self.span_ticks
+        let mut bytes: usize = self.kept.iter().map(|kept| kept.bytes.len()).sum();
+        while self.kept.len() > 1
+            && let Some(oldest) = self.kept.front()
+            && (held - oldest.ticks >= self.span_ticks || bytes > MAX_BYTES)
         {
             held -= oldest.ticks;
+            bytes -= oldest.bytes.len();
             self.kept.pop_front();
         }
     }
