@@ -141,7 +141,7 @@ impl Recorder {
             }
         }
         if orders.len() as u32 != ticked.orders {
-            self.open = None;
+            self.close();
             self.gap = true;
         }
         if let Some((chunk, last)) = &mut self.open {

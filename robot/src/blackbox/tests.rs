@@ -147,7 +147,7 @@ impl Bench {
             ticket: Ticket { number, ..TICKET },
             model: Some([0xab; 16]),
             source,
-            scale: 0.15,
+            scale: 0.6,
             rotation: UnitQuaternion::identity(),
             lease,
         }));
@@ -222,7 +222,7 @@ fn a_motion_that_silence_ends_replays_to_the_bit_and_tells_its_story() {
     assert_eq!(reports, bench.reports);
     for words in [
         "an operator has authority",
-        "asked to engage #1: mirror at scale 0.150, skill abababababab",
+        "asked to engage #1: mirror at scale 0.600, skill abababababab",
         "Engaged (Requested)",
         "Coasting (NewsLate)",
         "Holding (LeaseExpired)",

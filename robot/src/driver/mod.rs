@@ -132,11 +132,11 @@ impl DriverArm {
         Ok(())
     }
 
-    /// Whether the arm obeys, and is where it was told to be as long ago as it may be behind.
-    fn follows(&self, now: Mono) -> Result<(), ArmFault> {
-        if self.seq == 0 {
+    /// Whether the arm, when it was last heard of, obeyed the setpoints of then and was where they had told it to be.
+    fn follows(&self) -> Result<(), ArmFault> {
+        let (1.., Some(heard_at)) = (self.seq, self.heard_at) else {
             return Ok(());
-        }
+        };
         // A setpoint that was never made is none that could be obeyed.
         let obeyed = self.obeyed.min(self.seq);
         let waiting = self.seq - obeyed;
@@ -144,7 +144,7 @@ impl DriverArm {
             let since = if waiting as usize >= REMEMBERED {
                 f64::INFINITY
             } else {
-                now.secs_since(self.made[(obeyed + 1) as usize % REMEMBERED].0)
+                heard_at.secs_since(self.made[(obeyed + 1) as usize % REMEMBERED].0)
             };
             if since > self.config.patience_s {
                 let behind_ms = (since * 1e3).min(f64::from(u32::MAX)) as u32;
@@ -185,7 +185,7 @@ impl Manipulator for DriverArm {
                 let silent_ms = (silent_s * 1e3) as u32;
                 Some(ArmFault::Stalled { silent_ms })
             } else {
-                self.follows(now).err()
+                self.follows().err()
             };
         }
         (self.state, self.fault)
