@@ -14,7 +14,7 @@ use crate::servo::{ArmFault, CoreState, Order};
 /// After a stop this much more is recorded if the arm does not come to rest before, ticks.
 const AFTERMATH_TICKS: u64 = 2000;
 
-/// No more than this is kept, bytes: two minutes take a quarter of it, unless somebody floods.
+/// No more than this is kept, bytes: two minutes of motion take about a quarter of it.
 const MAX_BYTES: usize = 128 << 20;
 
 /// What a [`Recorder`] is fed through.
