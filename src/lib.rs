@@ -8,10 +8,12 @@ macro_rules! say {
     }};
 }
 
+mod arm;
 pub mod cli;
 mod codec;
 mod demo;
 mod evaluate;
+mod experiment;
 mod figure;
 pub mod ground;
 mod ingest;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use telemime_protocol::wire::v1::{Info, RobotState};
 use telemime_sim::arm::{
-    ArmError, ArmModel, Gripper, Joints, LoadOptions, Plant, PlantError, default_urdf,
+    ArmError, ArmModel, ContactPlane, Gripper, Joints, LoadOptions, Plant, PlantError, default_urdf,
 };
 
 use crate::control::{ControlConfig, ControlError, Controller, home_posture, workspace_radius};
@@ -32,6 +32,8 @@ pub struct RigOptions {
     pub safety: SafetyConfig,
     /// The arm is behind a driver: its dead time is its own and not simulated, and an engage begins at the setpoint it holds.
     pub driver: bool,
+    /// A surface that the simulated tip may touch.
+    pub contact: Option<ContactPlane>,
 }
 
 /// Why there is no rig.
@@ -175,7 +177,7 @@ impl Rig {
             from_setpoint: options.driver,
         };
         Ok(Self {
-            plant: Plant::new(arm.clone(), &home)?,
+            plant: Plant::new(arm.clone(), &home)?.beside(options.contact),
             arm,
             home,
             workspace,

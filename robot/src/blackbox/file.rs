@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::codec;
+use telemime_sim::arm::Payload;
 
 use super::recorder::{Chunk, Due, Kept};
 use super::ticks::width;
@@ -44,6 +45,8 @@ pub struct Header {
     pub tip: Option<String>,
     /// Joints that were fixed, rad or m.
     pub fixed: BTreeMap<String, f64>,
+    /// What the tip carries.
+    pub payload: Option<Payload>,
     /// The start posture, rad or m.
     pub home: Vec<f64>,
     /// Bandwidth, limits and tick.
@@ -153,6 +156,8 @@ impl Header {
             control,
             safety,
             driver: _,
+            // Where the arm is, whatever pushed it there, is recorded.
+            contact: _,
         } = options.clone();
         Self {
             version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -160,6 +165,7 @@ impl Header {
             urdf_text: urdf_text.to_owned(),
             tip: load.tip,
             fixed: load.fixed,
+            payload: load.payload,
             home: rig.home.iter().take(rig.arm.dof()).copied().collect(),
             control,
             safety,
@@ -174,11 +180,13 @@ impl Header {
             load: telemime_sim::arm::LoadOptions {
                 tip: self.tip.clone(),
                 fixed: self.fixed.clone(),
+                payload: self.payload,
             },
             start: Some(self.home.clone()),
             control: self.control,
             safety: self.safety,
             driver: self.driver.is_some(),
+            contact: None,
         }
     }
 
