@@ -115,7 +115,8 @@ pub(super) fn row(ticked: &Ticked, dof: usize) -> Vec<u64> {
         u64::from(ticked.pulled.bits()),
         u64::from(strain.clamped)
             | u64::from(strain.stopped) << 16
-            | u64::from(strain.invalid) << 32,
+            | u64::from(strain.invalid) << 32
+            | u64::from(strain.fast) << 48,
         outcome.state,
         outcome.clamps,
         outcome.digest,
@@ -141,6 +142,7 @@ pub(super) fn read(row: &[u64], dof: usize) -> (Told, Outcome, u32) {
             clamped: row[2] as u16,
             stopped: (row[2] >> 16) as u16,
             invalid: (row[2] >> 32) as u16,
+            fast: (row[2] >> 48) as u16,
         },
         before: take_arm(arms, dof),
         after: take_arm(&arms[1 + 2 * dof..], dof),
