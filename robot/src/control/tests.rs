@@ -150,14 +150,14 @@ fn a_demand_far_outside_keeps_every_joint_within_limits() {
             assert!(out.tau.iter().all(|x| x.is_finite()));
             for (i, joint) in joints.iter().enumerate() {
                 assert!(out.tau[i].abs() <= joint.effort);
-                assert!(out.q_ref[i] >= joint.lower && out.q_ref[i] <= joint.upper);
-                let asked = (out.q_ref[i] - last_ref[i]).abs() / DT;
+                assert!(out.setpoint.q[i] >= joint.lower && out.setpoint.q[i] <= joint.upper);
+                let asked = (out.setpoint.q[i] - last_ref[i]).abs() / DT;
                 assert!(asked <= joint.velocity * (1.0 + 1e-9), "{asked}");
                 // Measured speed may exceed it while torque is cut.
                 let speed = rig.plant.qd()[i].abs();
                 assert!(speed <= joint.velocity * 1.25, "{}: {speed}", joint.name);
             }
-            last_ref = out.q_ref;
+            last_ref = out.setpoint.q;
         }
     }
     let counts = rig.controller.counts();
@@ -235,7 +235,7 @@ fn jumps(seed: u64, every: usize, radius: f64) -> [(f64, f64); 2] {
             target = rig.start + direction.normalize() * radius;
         }
         let out = rig.follow(target);
-        kinematics.update(&rig.arm, &out.q_ref);
+        kinematics.update(&rig.arm, &out.setpoint.q);
         tips[0].push(kinematics.tip());
         tips[1].push(out.tip);
         let beyond = (out.tip - rig.start).norm() - radius;
@@ -296,7 +296,7 @@ fn limits_of_turning_hold_at_the_tip_wherever_the_target_turns() {
                 speed_scale: 1.0,
             });
             off = off.max((out.tip - out.reference.p).norm());
-            kinematics.update(&rig.arm, &out.q_ref);
+            kinematics.update(&rig.arm, &out.setpoint.q);
             let asked = super::ik::quaternion(kinematics.tip_rotation());
             for (i, now) in [asked, out.orientation].into_iter().enumerate() {
                 let (last, speed) = before[i];
