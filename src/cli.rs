@@ -11,7 +11,7 @@ use telemime_sim::link::{
 };
 
 use crate::{
-    codec, demo, evaluate, experiment, ingest, link, paper, recognise, select, tap, teach,
+    arm, codec, demo, evaluate, experiment, ingest, link, paper, recognise, select, tap, teach,
 };
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
@@ -27,10 +27,11 @@ struct Cli {
     demo: demo::Args,
 }
 
+#[expect(clippy::large_enum_variant, reason = "there is one, parsed once")]
 #[derive(Subcommand)]
 enum Command {
     /// Both daemons as two processes over a shaped link, and what became of the delay.
-    Demo(demo::Args),
+    Demo(Box<demo::Args>),
     /// Make demonstrations of raw recordings: skeletons, or tables of a hand's path.
     Import(Box<ingest::Args>),
     /// Learn a skill from a folder of demonstrations and save it.
@@ -53,6 +54,7 @@ enum Command {
     Operator(Box<telemime_operator::cli::Args>),
     /// The robot daemon: an arm that follows.
     Robot(telemime_robot::cli::Args),
+    Arm(arm::Args),
     Identity(admin::IdentityArgs),
     Pair(telemime_operator::cli::PairArgs),
     Peers(admin::PeersArgs),
@@ -157,6 +159,7 @@ pub fn main() -> ExitCode {
         Some(Command::Tap(args)) => tap::run(args),
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),
+        Some(Command::Arm(args)) => arm::run(args),
         Some(Command::Identity(args)) => admin::identity(args, Role::Operator),
         Some(Command::Pair(args)) => telemime_operator::cli::pair(args),
         Some(Command::Peers(args)) => admin::peers(args),

@@ -8,6 +8,7 @@ macro_rules! say {
     }};
 }
 
+mod arm;
 pub mod cli;
 mod codec;
 mod demo;

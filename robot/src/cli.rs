@@ -2,6 +2,7 @@
 
 mod record;
 mod report;
+mod surroundings;
 
 use std::io::IsTerminal;
 use std::net::SocketAddr;
@@ -15,7 +16,7 @@ use telemime_endpoint::cli::{self, Printer};
 use telemime_endpoint::pairing::Own;
 use telemime_endpoint::peers::{Role, Source, Whom};
 use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Trust, quic};
-use telemime_sim::arm::LoadOptions;
+use telemime_sim::arm::{LoadOptions, Payload};
 use telemime_sim::link::parse_duration_s;
 use tokio::sync::mpsc;
 
@@ -83,10 +84,19 @@ pub struct Args {
         allow_negative_numbers = true
     )]
     pub start: Option<Vec<f64>>,
+    /// What the tip carries: KG, KG@X,Y,Z (centre, m from the tip) or KG@X,Y,Z@IXX,IYY,IZZ (moments, kg·m²).
+    #[arg(long, value_name = "KG[@X,Y,Z]")]
+    pub payload: Option<Payload>,
+    /// The tip, and the links that start there, stay above this height over the base, m.
+    #[arg(long, value_name = "Z", allow_negative_numbers = true)]
+    pub keep_above: Option<f64>,
+    /// A surface the simulated tip may touch: all points with NX·x + NY·y + NZ·z = D, m, solid behind.
+    #[arg(long, value_name = "NX,NY,NZ,D", allow_negative_numbers = true, value_parser = surroundings::four)]
+    pub contact_plane: Option<[f64; 4]>,
     /// The arm obeys this much late, 0 to 50ms; the prediction makes up for it [default: 0ms].
     #[arg(long, value_name = "TIME", value_parser = parse_duration_s)]
     pub dead_time: Option<f64>,
-    /// Bandwidth of the filter between prediction and arm, rad/s: less is smoother, and farther behind [default: 45].
+    /// Bandwidth of the filter between prediction and arm, rad/s: less is smoother, and farther behind [default: 40].
     #[arg(long, value_name = "RAD_S")]
     pub bandwidth: Option<f64>,
     /// Speak protocol versions up to this one; 2 is an experiment [default: 1].
@@ -119,13 +129,26 @@ struct File {
     #[serde(default)]
     fixed: std::collections::BTreeMap<String, f64>,
     start: Option<Vec<f64>>,
+    payload: Option<String>,
+    keep_above_m: Option<f64>,
+    /// Normal and place of each: what has n·x ≥ d is allowed.
+    #[serde(default)]
+    planes: Vec<[f64; 4]>,
+    self_collision: Option<bool>,
+    stop_distance_m: Option<f64>,
+    slow_distance_m: Option<f64>,
+    contact_plane: Option<[f64; 4]>,
     dead_time_s: Option<f64>,
     bandwidth_rad_s: Option<f64>,
     protocol_max: Option<u16>,
     record: Option<PathBuf>,
 }
 
-fn parse_fixed(text: &str) -> Result<(String, f64), String> {
+/// `JOINT=VALUE` as a joint's name and its value, rad or m.
+///
+/// # Errors
+/// What is wrong with the text.
+pub fn parse_fixed(text: &str) -> Result<(String, f64), String> {
     let (joint, value) = text.split_once('=').ok_or("write JOINT=VALUE")?;
     let value = value
         .parse::<f64>()
@@ -150,6 +173,9 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         Some(path) => read_config(path)?,
         None => File::default(),
     };
+    let barrier = surroundings::barrier(args, &file)?;
+    let contact = surroundings::contact(args, &file)?;
+    let payload = surroundings::payload(args, &file)?;
     let identity = args.identity.clone().or(file.identity);
     let key_file = identity.unwrap_or_else(|| admin::key_file(Role::Robot));
     let identity = Identity::load_or_create(&key_file)?;
@@ -186,7 +212,9 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         load: LoadOptions {
             tip: args.tip.clone().or(file.tip),
             fixed,
+            payload,
         },
+        contact,
         start: args.start.clone().or(file.start),
         control: ControlConfig {
             dead_time_s: args.dead_time.or(file.dead_time_s).unwrap_or(0.0),
@@ -194,6 +222,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
                 .bandwidth
                 .or(file.bandwidth_rad_s)
                 .unwrap_or(ControlConfig::default().omega),
+            barrier,
             ..ControlConfig::default()
         },
         ..RigOptions::default()

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use telemime_protocol::wire::v1::{Info, RobotState};
 use telemime_sim::arm::{
-    ArmError, ArmModel, Gripper, Joints, LoadOptions, Plant, PlantError, default_urdf,
+    ArmError, ArmModel, ContactPlane, Gripper, Joints, LoadOptions, Plant, PlantError, default_urdf,
 };
 
 use crate::control::{ControlConfig, ControlError, Controller, home_posture, workspace_radius};
@@ -28,6 +28,8 @@ pub struct RigOptions {
     pub control: ControlConfig,
     /// The state machine's settings.
     pub safety: SafetyConfig,
+    /// A surface that the simulated tip may touch.
+    pub contact: Option<ContactPlane>,
 }
 
 /// Why there is no rig.
@@ -145,7 +147,7 @@ impl Rig {
             workspace,
         };
         Ok(Self {
-            plant: Plant::new(arm.clone(), &home)?,
+            plant: Plant::new(arm.clone(), &home)?.beside(options.contact),
             arm,
             home,
             workspace,

@@ -29,6 +29,7 @@ struct State {
     links: BTreeMap<(SocketAddr, SocketAddr), Link>,
     down: bool,
     sockets: u64,
+    under_way: usize,
     tape: Option<Vec<Taped>>,
     log: Option<Vec<Passage>>,
 }
@@ -74,6 +75,7 @@ impl Network {
             links: BTreeMap::new(),
             down: false,
             sockets: 0,
+            under_way: 0,
             tape: None,
             log: None,
         })))
@@ -140,6 +142,18 @@ impl Network {
         count
     }
 
+    /// Delivers a packet that nobody has sent, as if it came from `from`.
+    pub fn forge(&self, from: SocketAddr, to: SocketAddr, packet: Vec<u8>) {
+        self.deliver(from, to, packet);
+    }
+
+    /// Packets on their way, and those that nobody has read yet.
+    pub fn queued(&self) -> (usize, usize) {
+        let state = self.state();
+        let unread = state.inboxes.values().map(|inbox| inbox.packets.len());
+        (state.under_way, unread.sum())
+    }
+
     fn state(&self) -> MutexGuard<'_, State> {
         self.0
             .lock()
@@ -181,8 +195,10 @@ impl Network {
                 continue;
             }
             let at = at(delivery.at_ns);
+            self.state().under_way += 1;
             tokio::spawn(async move {
                 sleep_until(at).await;
+                network.state().under_way -= 1;
                 network.deliver(from, to, packet);
             });
         }
@@ -209,6 +225,20 @@ pub struct Socket {
     network: Network,
     addr: SocketAddr,
     id: u64,
+}
+
+impl Drop for Socket {
+    /// What is sent to a socket that is closed piles up nowhere.
+    fn drop(&mut self) {
+        let mut state = self.network.state();
+        if state
+            .inboxes
+            .get(&self.addr)
+            .is_some_and(|i| i.id == self.id)
+        {
+            state.inboxes.remove(&self.addr);
+        }
+    }
 }
 
 impl fmt::Debug for Socket {

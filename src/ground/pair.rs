@@ -24,13 +24,14 @@ use telemime_protocol::time::Stamp;
 use telemime_robot::daemon::{Daemon as RobotDaemon, Notice as RobotNotice};
 use telemime_robot::desk::Desk;
 use telemime_robot::rig::Rig;
-use telemime_robot::servo::{self, Report};
+use telemime_robot::servo::Report;
 use telemime_robot::session::SessionConfig as RobotConfig;
 use telemime_sim::link::LinkConfig;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::net::Network;
+use super::tap::{Watched, Watcher};
 
 /// Why a pair could not run.
 #[derive(Debug, thiserror::Error)]
@@ -99,6 +100,7 @@ pub struct Pair {
     clock: HostClock,
     config: RobotConfig,
     external: Option<(External, External)>,
+    watcher: Option<Watcher>,
     robot_identity: Identity,
     operator_identity: Identity,
     operators: u8,
@@ -113,6 +115,7 @@ pub struct Robot {
     notices: Rc<RefCell<Vec<RobotNotice>>>,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
+    endpoint: quinn::Endpoint,
     tasks: Rc<[tokio::task::AbortHandle; 2]>,
 }
 
@@ -137,17 +140,16 @@ impl Robot {
         identity: &Identity,
         trust: &Trust,
         config: RobotConfig,
-        external: Option<External>,
+        (external, watcher): (Option<External>, Option<Watcher>),
     ) -> Result<Self, PairError> {
-        let (rings, handle) = servo::rings();
-        let mut core = rig.servo(rings);
+        let (mut core, handle) = Watched::new(|rings| rig.servo(rings), clock, watcher);
         let period = Duration::from_secs_f64(core.tick_s());
         let servo = tokio::task::spawn_local(async move {
             let mut tick = interval(period);
             tick.set_missed_tick_behavior(MissedTickBehavior::Burst);
             loop {
                 tick.tick().await;
-                core.tick(clock.now());
+                core.tick();
             }
         });
         let socket = quic::Socket::Abstract {
@@ -155,6 +157,7 @@ impl Robot {
             seed: [1; 32],
         };
         let endpoint = quic::server(identity, trust, socket, &Meter::default())?;
+        let connections = endpoint.clone();
         let own = Own {
             name: Name::made_of("virtual-robot"),
             key: identity.fingerprint(),
@@ -171,6 +174,7 @@ impl Robot {
             notices: Rc::default(),
             quit,
             words,
+            endpoint: connections,
             tasks: Rc::new([servo.abort_handle(), serving.abort_handle()]),
         };
         let log = robot.clone();
@@ -199,6 +203,17 @@ impl Robot {
     /// Everything else it noticed so far.
     pub fn notices(&self) -> std::cell::Ref<'_, Vec<RobotNotice>> {
         self.notices.borrow()
+    }
+
+    /// Forgets every tick and notice so far, and returns the notices: hours do not fit into memory.
+    pub fn forget(&self) -> Vec<RobotNotice> {
+        self.reports.borrow_mut().clear();
+        self.notices.take()
+    }
+
+    /// Connections its endpoint keeps anything of.
+    pub fn connections(&self) -> usize {
+        self.endpoint.open_connections()
     }
 
     /// A word at the robot's own terminal.
@@ -232,6 +247,11 @@ impl Operator {
         Ok(self.endpoint.rebind_abstract(socket)?)
     }
 
+    /// Connections its endpoint keeps anything of.
+    pub fn connections(&self) -> usize {
+        self.endpoint.open_connections()
+    }
+
     /// A word at the operator's own terminal.
     pub fn say(&self, word: Word) {
         // The daemon has ended if nobody hears it.
@@ -258,7 +278,7 @@ impl Pair {
     /// # Errors
     /// [`PairError`].
     pub fn start_with(rig: &Rig, config: RobotConfig) -> Result<Self, PairError> {
-        Self::start_as(rig, config, None)
+        Self::start_as(rig, config, None, None)
     }
 
     /// As [`Pair::start`], with disciplined clocks at the robot and at the operators.
@@ -270,13 +290,27 @@ impl Pair {
         robot: External,
         operators: External,
     ) -> Result<Self, PairError> {
-        Self::start_as(rig, Default::default(), Some((robot, operators)))
+        Self::start_as(rig, Default::default(), Some((robot, operators)), None)
+    }
+
+    /// As [`Pair::start`], under the eyes of `watcher`; with disciplined clocks, the robot's and the operators', if there
+    /// are any.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn start_watched(
+        rig: &Rig,
+        watcher: Watcher,
+        external: Option<(External, External)>,
+    ) -> Result<Self, PairError> {
+        Self::start_as(rig, Default::default(), external, Some(watcher))
     }
 
     fn start_as(
         rig: &Rig,
         config: RobotConfig,
         external: Option<(External, External)>,
+        watcher: Option<Watcher>,
     ) -> Result<Self, PairError> {
         let network = Network::new();
         let clock = HostClock::from_zero();
@@ -290,7 +324,7 @@ impl Pair {
             &robot_identity,
             &trust,
             config,
-            robots,
+            (robots, watcher.clone()),
         )?;
         Ok(Self {
             network,
@@ -299,6 +333,7 @@ impl Pair {
             clock,
             config,
             external,
+            watcher,
             robot_identity,
             operator_identity,
             operators: 0,
@@ -323,7 +358,7 @@ impl Pair {
             identity,
             &self.trust,
             self.config,
-            external,
+            (external, self.watcher.clone()),
         )?;
         Ok(())
     }

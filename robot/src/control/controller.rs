@@ -5,11 +5,13 @@ use std::sync::Arc;
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_sim::arm::{ArmModel, DeadTime, DeadTimeError, Joints, PlantError, check_start};
 
+use super::barrier::Barrier;
 use super::ik::{DifferentialIk, quaternion};
 use super::turn::checked;
 use super::{
-    CartesianLimits, ComputedTorque, FilterConfig, FilterError, FilterState, IkConfig,
-    JointReference, LimitedFilter, TurnFilter, TurnLimits, TurnState, joint_accelerations,
+    BarrierConfig, BarrierError, CartesianLimits, ComputedTorque, FilterConfig, FilterError,
+    FilterState, IkConfig, JointReference, LimitedFilter, TurnFilter, TurnLimits, TurnState,
+    joint_accelerations,
 };
 
 /// The filter's reference may lead the joints' reference by this much, m; beyond, the arm cannot follow and the filter waits for it.
@@ -35,6 +37,8 @@ pub struct ControlConfig {
     pub posture_gain: f64,
     /// The arm obeys its setpoints this much later, s, at most [`MAX_DEAD_TIME_S`](telemime_sim::arm::MAX_DEAD_TIME_S).
     pub dead_time_s: f64,
+    /// What the arm is kept from: itself, and planes.
+    pub barrier: BarrierConfig,
     /// Tick, s.
     pub dt_s: f64,
 }
@@ -43,7 +47,8 @@ impl Default for ControlConfig {
     /// 1 kHz, and the tip limits of a published arm.
     fn default() -> Self {
         Self {
-            omega: 45.0,
+            // 3/ω is part of the horizon, and ω³ of the jerk: the fastest that is no rougher than the hand itself on recorded gestures.
+            omega: 40.0,
             limits: CartesianLimits {
                 v_max: 1.7,
                 a_max: 13.0,
@@ -58,6 +63,7 @@ impl Default for ControlConfig {
             orientation_gain: 8.0,
             posture_gain: 1.0,
             dead_time_s: 0.0,
+            barrier: BarrierConfig::default(),
             dt_s: 1e-3,
         }
     }
@@ -75,6 +81,9 @@ pub enum ControlError {
     /// The arm's dead time is out of range.
     #[error(transparent)]
     DeadTime(#[from] DeadTimeError),
+    /// The barrier's distances or planes are impossible.
+    #[error(transparent)]
+    Barrier(#[from] BarrierError),
     /// A gain that is not a positive number.
     #[error("{what} is {value}; it must be a positive number, and small against 1/dt")]
     Gain {
@@ -138,6 +147,10 @@ pub struct Clamps {
     pub turn_held_back: bool,
     /// The demand or the measured state was not finite, or its orientation not a unit quaternion: stopped, or controlled by the reference.
     pub invalid: bool,
+    /// The joints' step was slowed, or led aside, to keep the links apart.
+    pub near_itself: bool,
+    /// The same to keep the tip and the links inside of a plane, or the target was moved there.
+    pub near_plane: bool,
     /// Joints held back by their end of range.
     pub at_limit: u16,
     /// Joints whose torque was cut.
@@ -163,6 +176,10 @@ pub struct ClampCounts {
     pub turn_held_back: u64,
     /// See [`Clamps::invalid`].
     pub invalid: u64,
+    /// See [`Clamps::near_itself`].
+    pub near_itself: u64,
+    /// See [`Clamps::near_plane`].
+    pub near_plane: u64,
     /// Ticks with any joint of [`Clamps::at_limit`].
     pub at_limit: u64,
     /// Ticks with any joint of [`Clamps::torque`].
@@ -179,6 +196,8 @@ impl ClampCounts {
         self.held_back += u64::from(clamps.held_back);
         self.turn_held_back += u64::from(clamps.turn_held_back);
         self.invalid += u64::from(clamps.invalid);
+        self.near_itself += u64::from(clamps.near_itself);
+        self.near_plane += u64::from(clamps.near_plane);
         self.at_limit += u64::from(clamps.at_limit != 0);
         self.torque += u64::from(clamps.torque != 0);
     }
@@ -256,7 +275,14 @@ impl Controller {
             posture_gain: config.posture_gain,
             dt_s: config.dt_s,
         };
-        let mut ik = DifferentialIk::new(Arc::clone(&arm), ik_config, accelerations, &q);
+        let barrier = Barrier::new(
+            Arc::clone(&arm),
+            &config.barrier,
+            accelerations,
+            &q,
+            config.dt_s,
+        )?;
+        let mut ik = DifferentialIk::new(Arc::clone(&arm), ik_config, accelerations, barrier, &q);
         let filter_config = FilterConfig {
             omega: config.omega,
             v_max: limits.v_max,
@@ -353,6 +379,8 @@ impl Controller {
         clamps.slowed = step.slowed;
         clamps.turning |= step.turn_slowed;
         clamps.singular = step.singular;
+        clamps.near_itself = step.near_itself;
+        clamps.near_plane |= step.near_plane;
         clamps.at_limit = step.at_limit;
         let lead = step.error_m.norm();
         if lead > LEASH_M {
@@ -419,6 +447,8 @@ impl Controller {
             clamps.turning = self.turn.stop();
             return (false, None);
         }
+        let (target, clipped) = self.ik.clip(target);
+        clamps.near_plane = clipped;
         clamps.filter = self.filter.follow(target, speed_scale);
         clamps.turning = match unit {
             Some(unit) => {

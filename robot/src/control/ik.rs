@@ -5,6 +5,7 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Rotation3, SMatrix, SymmetricEigen, UnitQuaternion, Vector3};
 use telemime_sim::arm::{ArmModel, Jacobian, Joints, Kinematics, MAX_JOINTS};
 
+use super::barrier::Barrier;
 use super::filter::limited;
 use super::turn::{TurnState, rotation_between};
 
@@ -60,6 +61,10 @@ pub struct JointStep {
     pub turn_slowed: bool,
     /// The tip is near a singular posture: motion is damped.
     pub singular: bool,
+    /// The step was slowed, or led aside, to keep the links apart.
+    pub near_itself: bool,
+    /// The same to keep what a plane guards inside.
+    pub near_plane: bool,
     /// Joints held back by their end of range.
     pub at_limit: u16,
     /// Where the reference is to be, less where it is, m.
@@ -237,6 +242,7 @@ pub(super) struct DifferentialIk {
     /// The same, rad/s.
     angular_velocity: Vector3<f64>,
     kinematics: Kinematics,
+    barrier: Barrier,
 }
 
 impl DifferentialIk {
@@ -245,6 +251,7 @@ impl DifferentialIk {
         arm: Arc<ArmModel>,
         config: IkConfig,
         accelerations: Joints,
+        barrier: Barrier,
         q: &Joints,
     ) -> Self {
         let mut ik = Self {
@@ -263,6 +270,7 @@ impl DifferentialIk {
             tip_velocity: Vector3::zeros(),
             angular_velocity: Vector3::zeros(),
             kinematics: Kinematics::new(),
+            barrier,
         };
         ik.reset(q);
         ik
@@ -282,6 +290,11 @@ impl DifferentialIk {
         self.kinematics.update(&self.arm, q);
         self.orientation = *self.kinematics.tip_rotation();
         self.kinematics.tip()
+    }
+
+    /// The nearest place that no plane excludes, and whether that is another one.
+    pub(super) fn clip(&self, target: Vector3<f64>) -> (Vector3<f64>, bool) {
+        self.barrier.clip(target)
     }
 
     pub(super) fn reference(&self) -> &JointReference {
@@ -393,6 +406,8 @@ impl DifferentialIk {
             next[i] = next[i].clamp(lower[i].max(-f64::MAX), upper[i].min(f64::MAX));
             next[i] = next[i].clamp(qd[i] - most[i], qd[i] + most[i]);
         }
+        let (next_apart, hindered) = self.barrier.guard((&q, &qd), next, (&lower, &upper), &most);
+        next = next_apart;
         let mut q_next = q + (qd + next) * (0.5 * h);
         for (i, joint) in self.arm.joints().iter().enumerate() {
             let inside = q_next[i].clamp(joint.lower, joint.upper);
@@ -412,6 +427,8 @@ impl DifferentialIk {
         JointStep {
             slowed: held || primary_share < 1.0 || change_share < 1.0,
             singular: sigma_min < epsilon,
+            near_itself: hindered.by_itself,
+            near_plane: hindered.by_plane,
             at_limit,
             error_m,
             tip_velocity: self.tip_velocity,

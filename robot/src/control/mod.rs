@@ -3,6 +3,7 @@
 //! Nothing here allocates after construction: every vector has a fixed size and every workspace is a field. Nothing here
 //! reads a clock: a tick is `dt_s` long.
 
+mod barrier;
 mod controller;
 mod filter;
 mod ik;
@@ -13,6 +14,7 @@ mod turn;
 #[cfg(test)]
 mod tests;
 
+pub use barrier::{BarrierConfig, BarrierError, MAX_PLANES, Plane};
 pub use controller::{
     ClampCounts, Clamps, ControlConfig, ControlError, Controller, Demand, Output,
 };
