@@ -343,6 +343,7 @@ fn enumerations() {
         Cause::LocalStop,
         Cause::ClockStep,
         Cause::Fault,
+        Cause::ArmFault,
     ];
     let refusals = [
         Refusal::Stopped,

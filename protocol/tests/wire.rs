@@ -160,6 +160,7 @@ fn cause() -> impl Strategy<Value = Cause> {
         Cause::LocalStop,
         Cause::ClockStep,
         Cause::Fault,
+        Cause::ArmFault,
     ])
 }
 

@@ -130,8 +130,8 @@ fn attack(seed: u64, minutes: f64, barrier: BarrierConfig, simulated: bool) -> L
             plant.step(&out.tau, DT_S);
             (q, qd) = (*plant.q(), *plant.qd());
         } else {
-            qd = (out.q_ref - q) / DT_S;
-            q = out.q_ref;
+            qd = (out.setpoint.q - q) / DT_S;
+            q = out.setpoint.q;
         }
         kinematics.update(&arm, &q);
         hulls.place(&kinematics);

@@ -26,7 +26,7 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::v1;
 use telemime_robot::rig::{Rig, RigOptions};
-use telemime_robot::servo::{self, Core, Order};
+use telemime_robot::servo::{self, Order, Station};
 use telemime_robot::session as robot;
 
 /// Length of the bare messages, B; about that of a motion.
@@ -201,7 +201,7 @@ fn bare() -> Ends {
 struct Engaged {
     operator: operator::Session,
     robot: robot::Session,
-    core: Core,
+    station: Station,
     handle: servo::Handle,
     clock: HostClock,
 }
@@ -230,7 +230,7 @@ impl Engaged {
         let mut engaged = Self {
             operator: operator::Session::new(config, None, EPOCH),
             robot: robot::Session::new(Default::default(), rig.info(), EPOCH, None, now),
-            core: rig.servo(rings),
+            station: rig.servo(rings),
             handle,
             clock,
         };
@@ -277,7 +277,7 @@ impl Engaged {
                 robot::Output::Brake(_) | robot::Output::Goodbye => {}
             }
         }
-        let report = self.core.tick(now);
+        let report = self.station.tick(now);
         self.robot.handle_report(&report, Default::default());
     }
 

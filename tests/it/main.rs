@@ -6,10 +6,12 @@
 
 mod alignment;
 mod arms;
+mod blackbox;
 mod codec;
 mod commands;
 mod correct;
 mod data;
+mod driver;
 mod evaluate;
 mod floods;
 mod frames;
