@@ -8,7 +8,7 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use quinn::{Connecting, Connection, Endpoint};
+use quinn::{ConnectError, Connecting, Connection, Endpoint};
 use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::quic::{self, Refusal};
 use telemime_protocol::wire::frame::Frame;
@@ -18,8 +18,11 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until, timeout};
 
-/// Attempts begin this far apart.
+/// Attempts begin this far apart …
 pub const REDIAL: Duration = Duration::from_millis(250);
+
+/// … and the first ones, of which nobody knows what the link carries, this.
+const FIRST_REDIAL: Duration = Duration::from_millis(500);
 
 /// Attempts begin this many times as far apart as the first packets' own length took on the last link, if that is
 /// more; but no farther than [`SLOWEST_REDIAL`]. Each is two packets of 1.2 kB: on 64 kbit/s, four a second would fill a
@@ -62,10 +65,18 @@ impl Link {
     }
 }
 
+impl Seen {
+    /// The least round trip counts: what a queue adds is no part of the path, and would have attempts wait for it.
+    pub(crate) fn learn(&mut self, connection: &Connection) {
+        self.rtt = self.rtt.min(connection.rtt());
+    }
+}
+
 /// What the last link was like.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Seen {
-    pub(crate) rtt: Duration,
+    /// The least.
+    rtt: Duration,
     answered: Duration,
 }
 
@@ -74,6 +85,8 @@ pub(crate) struct Seen {
 pub(crate) enum DialError {
     /// The next one may.
     Again(String),
+    /// None can any more: the endpoint has lost its socket.
+    NoSocket,
     /// The robot declines.
     Rejected { code: RejectCode, text: String },
     /// The robot's key is not the one that is pinned.
@@ -100,9 +113,10 @@ impl Pace {
             let lengths = seen.answered.saturating_sub(seen.rtt);
             (seen.rtt * ROUND_TRIPS + lengths, lengths)
         });
+        let least = seen.map_or(FIRST_REDIAL, |_| REDIAL);
         let brisk = brisk.clamp(LEAST_ATTEMPT, LONGEST_ATTEMPT);
         Self {
-            apart: (lengths * LENGTHS).clamp(REDIAL, SLOWEST_REDIAL),
+            apart: (lengths * LENGTHS).clamp(least, SLOWEST_REDIAL),
             brisk,
             patient: brisk,
         }
@@ -144,6 +158,13 @@ impl Dialler {
             answered_tx: watch::Sender::new(None),
             next: Instant::now(),
         }
+    }
+
+    /// Attempts begin at `endpoint` from now on, at once; those under way go on where they began.
+    pub(crate) fn move_to(&mut self, endpoint: &Endpoint) {
+        self.endpoint = endpoint.clone();
+        self.answered_tx.send_replace(None);
+        self.next = Instant::now();
     }
 
     /// The outcome of an attempt; `None` when a new one has begun instead, so that the caller looks up from time
@@ -188,9 +209,10 @@ async fn attempt(
     answered: watch::Sender<Option<Instant>>,
 ) -> Result<Link, DialError> {
     let begun = Instant::now();
-    let mut connecting = endpoint
-        .connect(robot, "telemime")
-        .map_err(|e| DialError::Again(e.to_string()))?;
+    let mut connecting = endpoint.connect(robot, "telemime").map_err(|e| match e {
+        ConnectError::EndpointStopping => DialError::NoSocket,
+        e => DialError::Again(e.to_string()),
+    })?;
     let silent =
         |_| DialError::Again("no answer: is the robot running, and does UDP reach it?".to_owned());
     let answer = timeout(within, connecting.handshake_data()).await;
@@ -273,7 +295,8 @@ mod tests {
                 answered: ms(rtt + 20),
             };
             let mut pace = Pace::new(rtt.map(seen));
-            assert_eq!(pace.apart, REDIAL, "{rtt:?}");
+            let apart = rtt.map_or(FIRST_REDIAL, |_| REDIAL);
+            assert_eq!(pace.apart, apart, "{rtt:?}");
             assert_eq!(pace.brisk, ms(brisk), "{rtt:?}");
             let mut due = brisk;
             for _ in 0..8 {

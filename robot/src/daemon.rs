@@ -22,7 +22,7 @@ use crate::door::{self, Door, Place, Verdict};
 use crate::refused::{Reason, Refused, Tally};
 use crate::servo::thread::Timing;
 use crate::servo::{Handle, Order, Report};
-use crate::session::{Counters, Output, Session, SessionConfig, TickTiming};
+use crate::session::{Counters, Output, Seen, Session, SessionConfig, TickTiming};
 
 /// How often reports are taken from the servo's ring.
 const DRAIN: Duration = Duration::from_millis(4);
@@ -95,6 +95,8 @@ pub enum Notice {
         origin: Origin,
         /// What the session counted.
         counters: Counters,
+        /// What became of its datagrams.
+        seen: Seen,
     },
     /// Somebody was turned away: told the first time, and then ever more rarely.
     Refused(Refused),
@@ -476,12 +478,13 @@ impl Daemon {
             .to_session(now)
             .zip(clock.uncertainty_s(now))
             .map(|(t, bound_s)| ((t.0 - now.0) as f64 * 1e-9, bound_s));
-        let counters = ended.counters();
+        let (counters, seen) = (ended.counters(), ended.seen());
         let _ = notices.send(Notice::Disconnected {
             why: why.to_owned(),
             clock,
             origin,
             counters,
+            seen,
         });
     }
 }

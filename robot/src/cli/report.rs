@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use serde::{Deserialize, Serialize};
 use telemime_endpoint::cli::Printer;
 use telemime_endpoint::pairing::Candidate;
+use telemime_endpoint::reception::{Quantiles, Received};
 
 use crate::desk::Progress;
 use crate::servo::Report;
@@ -37,6 +38,9 @@ pub enum Event {
         clock_offset_s: Option<f64>,
         clock_bound_s: Option<f64>,
         clock_origin: String,
+        up: Received,
+        down_delay: Option<Quantiles>,
+        age: Option<Quantiles>,
     },
     Refused {
         reason: String,
