@@ -11,7 +11,7 @@ use std::time::Duration;
 use quinn::{ConnectError, Connecting, Connection, Endpoint};
 use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::quic::{self, Refusal};
-use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::frame::{self, Frame};
 use telemime_protocol::wire::hello::{Answer, RejectCode};
 use telemime_protocol::wire::{Version, Versions};
 use tokio::sync::{mpsc, watch};
@@ -28,7 +28,7 @@ const FIRST_REDIAL: Duration = Duration::from_millis(500);
 /// more; but no farther than [`SLOWEST_REDIAL`]. Each is two packets of 1.2 kB: on 64 kbit/s, four a second would fill a
 /// queue for ever.
 const LENGTHS: u32 = 3;
-const SLOWEST_REDIAL: Duration = Duration::from_secs(1);
+const SLOWEST_REDIAL: Duration = Duration::from_secs(2);
 
 /// An attempt is given at least this long, and at least this many of the round trips last seen.
 const LEAST_ATTEMPT: Duration = Duration::from_millis(500);
@@ -40,6 +40,10 @@ const UNDISTURBED: Duration = Duration::from_secs(2);
 
 /// The longest time-out of an attempt.
 const LONGEST_ATTEMPT: Duration = Duration::from_secs(10);
+
+/// No answer to our greeting for so long: it may have overtaken the handshake's last packets, and is then thrown away. QUIC says
+/// it again after three round trips, or one if something later has arrived.
+const NUDGE: Duration = Duration::from_millis(30);
 
 /// Application close code of a robot that does not trust our key (docs/protocol.md §1).
 const NOT_TRUSTED: u32 = 5;
@@ -59,7 +63,7 @@ impl Link {
     /// What is to be known of the link, once it is lost.
     pub(crate) fn seen(&self) -> Seen {
         Seen {
-            rtt: self.connection.rtt(),
+            rtt: quic::least_rtt(&self.connection),
             answered: self.answered,
         }
     }
@@ -68,7 +72,7 @@ impl Link {
 impl Seen {
     /// The least round trip counts: what a queue adds is no part of the path, and would have attempts wait for it.
     pub(crate) fn learn(&mut self, connection: &Connection) {
-        self.rtt = self.rtt.min(connection.rtt());
+        self.rtt = self.rtt.min(quic::least_rtt(connection));
     }
 }
 
@@ -239,7 +243,15 @@ async fn connect(
     let mut control = Control::open(&connection).await.map_err(again)?;
     let hello = offered.hello().encode();
     control.write(&hello).await.map_err(again)?;
-    match control.answer().await.map_err(again)? {
+    let answer = match timeout(NUDGE, control.answer()).await {
+        Ok(answer) => answer,
+        Err(_) => {
+            let nothing = frame::encode(&[], true);
+            control.write(&nothing).await.map_err(again)?;
+            control.answer().await
+        }
+    };
+    match answer.map_err(again)? {
         Answer::Ack { version, epoch, .. } => {
             let Some(version) = offered.known(version) else {
                 return Err(DialError::Rejected {
@@ -310,7 +322,7 @@ mod tests {
     #[test]
     fn on_a_thin_link_attempts_are_farther_apart() {
         let ms = Duration::from_millis;
-        for (answered, apart) in [(180, 250), (300, 600), (3_000, 1_000)] {
+        for (answered, apart) in [(180, 250), (300, 600), (3_000, 2_000)] {
             let seen = Seen {
                 rtt: ms(100),
                 answered: ms(answered),

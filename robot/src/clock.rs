@@ -212,10 +212,12 @@ impl SessionClock {
             .map(|a| Stamp(mono.0.saturating_add(a.offset_ns.round() as i64)))
     }
 
-    /// Bound of the offset's error, s: half the best round trip and the drift since, whatever the path's asymmetry;
-    /// or the dispersions of both disciplined clocks.
+    /// Bound of the applied offset's error, s: half the best round trip and the drift since, whatever the path's asymmetry,
+    /// or the dispersions of both disciplined clocks; and what the offset still lacks of the estimate.
     pub fn uncertainty_s(&self, now: Mono) -> Option<f64> {
-        self.estimate(now).map(|(_, bound_s)| bound_s)
+        let (target_ns, bound_s) = self.estimate(now)?;
+        let behind_ns = self.applied.map_or(0.0, |a| target_ns - a.offset_ns);
+        Some(bound_s + behind_ns.abs() * 1e-9)
     }
 
     /// The shortest round trip seen lately, s.

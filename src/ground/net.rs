@@ -142,6 +142,21 @@ impl Network {
             Some(link) => link.send(now_ns, len),
             None => Fate::Deliver { at_ns: now_ns },
         };
+        if std::env::var_os("TRACE").is_some() {
+            eprintln!(
+                "{:.3} {} -> {} {} B {:?} down {} first {:02x}",
+                now_ns as f64 * 1e-9,
+                from.ip(),
+                to.ip(),
+                len,
+                match fate {
+                    Fate::Deliver { at_ns } => format!("{:.3}", at_ns as f64 * 1e-9),
+                    f => format!("{f:?}"),
+                },
+                state.down,
+                packet[0]
+            );
+        }
         let Fate::Deliver { at_ns } = fate else {
             return;
         };

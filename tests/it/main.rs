@@ -4,6 +4,7 @@
     reason = "clippy.toml allows it in tests, but does not know these helpers for tests"
 )]
 
+mod adapting;
 mod alignment;
 mod arms;
 mod codec;
@@ -18,7 +19,7 @@ mod horizon;
 mod ingest;
 mod interop;
 mod layout;
-mod link;
+
 mod mirror;
 mod pairing;
 mod paper;

@@ -3,8 +3,9 @@
 /// A delay this much above the least seen lately is a queue, s.
 const QUEUE_S: f64 = 0.1;
 
-/// The least delay is that of this span and the one before, s: a path may become longer.
-const SPAN_S: f64 = 15.0;
+/// The least delay is that of this span and the one before, s: a path may become longer, and the session clock moves by up to
+/// 5 ms/s.
+const SPAN_S: f64 = 5.0;
 
 /// One step slower …
 const SLOWER: f64 = 2.0;

