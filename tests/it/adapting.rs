@@ -9,7 +9,7 @@ use telemime_operator::session::{Counters, Event, FutureBound, Seen, SessionConf
 use telemime_operator::task::Outcome;
 use telemime_protocol::wire::v1::RobotState;
 use telemime_robot::servo::Report;
-use telemime_sim::link::LinkConfig;
+use telemime_sim::link::{LinkConfig, Loss, Rate};
 
 use crate::scene::{Samples, delayed, finish, performance, replay, rig, skill};
 
@@ -151,7 +151,7 @@ fn loss_is_counted_as_it_is_and_made_up_for() {
     let mut clean_m = f64::INFINITY;
     for loss in [0.0, 0.01, 0.05, 0.1, 0.2] {
         let link = LinkConfig {
-            loss,
+            loss: Loss::random(loss),
             jitter_s: 0.01,
             ..delayed(0.1)
         };
@@ -187,7 +187,7 @@ fn bursty(share: f64) -> impl Fn(f64) -> LinkConfig {
             >> 8;
         let gone = n > 0 && f64::from(mixed) < share * f64::from(1 << 24);
         LinkConfig {
-            loss: f64::from(u8::from(gone)),
+            loss: Loss::random(f64::from(u8::from(gone))),
             ..delayed(0.1)
         }
     }
@@ -210,7 +210,7 @@ fn bursts_are_made_up_for() {
 
 fn thin(kbit_s: f64) -> LinkConfig {
     LinkConfig {
-        rate_bit_s: Some(kbit_s * 1e3),
+        rate: Some(Rate::bits((kbit_s * 1e3) as u64)),
         ..delayed(0.05)
     }
 }

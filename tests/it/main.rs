@@ -19,7 +19,7 @@ mod horizon;
 mod ingest;
 mod interop;
 mod layout;
-
+mod link;
 mod mirror;
 mod pairing;
 mod paper;
