@@ -143,10 +143,6 @@ impl Network {
             Some(link) => link.send(now_ns, len),
             None => Fate::whole(now_ns),
         };
-        if std::env::var_os("TRACE").is_some() {
-            eprintln!("{:.3} {} -> {} {len} B down {} first {:02x}", now_ns as f64 * 1e-9, from.ip(), to.ip(), state.down, packet[0]);
-            for d in fate.deliveries() { eprintln!("     at {:.3}", d.at_ns as f64 * 1e-9); }
-        }
         if state.down {
             return;
         }

@@ -77,21 +77,7 @@ fn run(samples: &Samples, link: Changing, config: SessionConfig, seed: u64) -> R
             }
             pair.run_for(STEP_S).await;
         }
-        let (summary, task, notices) = finish(operator).await;
-        for n in &notices {
-            if let Notice::Event(t, Event::Refused(r)) = n {
-                println!("   refused {r:?} at {t:?}");
-            }
-            if let Notice::Note(n) = n {
-                println!("   {n}");
-            }
-            if let Notice::Lost { why } = n {
-                println!("   lost {why}");
-            }
-            if let Notice::Event(t, Event::State(s, c)) = n {
-                println!("   {s:?} {c:?} {t:?}");
-            }
-        }
+        let (summary, task, _) = finish(operator).await;
         let summary = summary.unwrap();
         let zero = pair.to_mono(task.zero().unwrap());
         let reports = pair.robot.reports();

@@ -92,8 +92,6 @@ impl Pace {
             || (self.repeats && self.loss > REPEAT_UNTIL);
         let delay_s = f64::from(telemetry.delay_ms) * 1e-3;
         let choked = self.loss > CHOKED;
-        if Self::naive() { return; }
-        if std::env::var_os("PACE").is_some() { eprintln!("{:.2} loss {:.3} burst {:.2} delay {delay_s:.3} starved {:.2} said {said} arrived {arrived}", now.as_secs_f64(), self.loss, self.burst, self.pacer.starved()); }
         self.pacer.observe(now.as_secs_f64(), delay_s, choked);
     }
 
@@ -102,10 +100,8 @@ impl Pace {
         let lost = reception.newest_seq.saturating_sub(reception.received);
         let (before, runs) = (self.lost, self.loss_runs);
         (self.lost, self.loss_runs) = (lost, reception.loss_runs);
-        let (lost, runs) = (
-            lost.saturating_sub(before),
-            self.loss_runs.saturating_sub(runs),
-        );
+        let lost = lost.saturating_sub(before);
+        let runs = self.loss_runs.saturating_sub(runs);
         if runs > 0 {
             let burst = f64::from(lost) / f64::from(runs);
             self.burst += 0.3 * (burst.max(1.0) - self.burst);
@@ -134,11 +130,8 @@ impl Pace {
         }
     }
 
-    fn naive() -> bool { std::env::var_os("NAIVE").is_some() }
-
     /// In how many messages a knot travels before it waits for its acknowledgement.
     pub(super) fn copies(&self) -> u8 {
-        if Self::naive() { return 2; }
         if self.pacer.starved() > 0.1 {
             return 1;
         }
@@ -158,7 +151,7 @@ impl Pace {
 
     /// Whether what is new is said a second time, [`REPEAT_S`] later.
     pub(super) fn repeats(&self) -> bool {
-        !Self::naive() && self.repeats && self.pacer.starved() == 0.0
+        self.repeats && self.pacer.starved() == 0.0
     }
 }
 

@@ -228,7 +228,7 @@ async fn write_long(
         LEAST_WINDOW
     };
     connection.set_send_window(window);
-    let (mut taken, mut full_since) = (0, None);
+    let (mut taken, mut full_since) = (0, None::<Instant>);
     for piece in bytes.chunks(PIECE) {
         send.write_all(piece).await?;
         taken += piece.len() as u64;

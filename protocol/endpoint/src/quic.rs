@@ -157,11 +157,7 @@ fn transport() -> TransportConfig {
         ))))
         .keep_alive_interval(Some(KEEP_ALIVE))
         .send_window(SEND_WINDOW)
-        .packet_threshold(if std::env::var_os("NAIVE_THRESHOLD").is_some() {
-            3
-        } else {
-            PACKET_THRESHOLD
-        })
+        .packet_threshold(PACKET_THRESHOLD)
         .datagram_send_buffer_size(DATAGRAM_SEND_BUFFER)
         .datagram_receive_buffer_size(Some(64 * 1024))
         .stream_receive_window(VarInt::from_u32(RECEIVE_WINDOW))
