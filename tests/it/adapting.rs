@@ -310,10 +310,12 @@ fn jitter_does_not_send_the_model_twice() {
         println!(
             "{bytes} B over {delay_s} ± {jitter_s} s: {took:.3?} s, without jitter {steady_s:.3} s"
         );
-        let mean_s = took.iter().sum::<f64>() / took.len() as f64;
+        let most_s = took.iter().copied().fold(0.0, f64::max);
+        // A greeting that overtakes the handshake is said again a little more than a round trip later.
+        let allowed_s = steady_s + 6.0 * delay_s + 0.05;
         assert!(
-            mean_s < 1.3 * steady_s,
-            "{mean_s} s, without jitter {steady_s} s"
+            most_s < allowed_s,
+            "{most_s} s, without jitter {steady_s} s"
         );
     }
 }
