@@ -234,8 +234,9 @@ impl Daemon {
                         let _ = notices.send(Notice::Pairing(self.desk.open(span)));
                     }
                     Word::Yes | Word::No => {
-                        let told = self.desk.word(word == Word::Yes).map(Notice::Pairing);
-                        told.map(|notice| notices.send(notice));
+                        if let Some(progress) = self.desk.word(word == Word::Yes) {
+                            let _ = notices.send(Notice::Pairing(progress));
+                        }
                     }
                     // What an operator says; a robot's terminal does not know them.
                     Word::Keep | Word::Refine | Word::Save(_) => {}
@@ -289,7 +290,9 @@ impl Daemon {
                         Arrival::Gone => None,
                     };
                     let told = refused.and_then(|(peer, reason, why)| self.refused.count(peer, reason, why));
-                    told.map(|refused| notices.send(Notice::Refused(refused)));
+                    if let Some(refused) = told {
+                        let _ = notices.send(Notice::Refused(refused));
+                    }
                 }
             }
         }

@@ -112,7 +112,9 @@ impl Network {
         let mut state = self.state();
         if let Some(inbox) = state.inboxes.remove(&addr) {
             state.vanished.insert(inbox.id);
-            inbox.waker.map(Waker::wake);
+            if let Some(waker) = inbox.waker {
+                waker.wake();
+            }
         }
     }
 

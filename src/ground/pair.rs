@@ -112,12 +112,15 @@ pub struct Pair {
     pub learning: Learning,
 }
 
+/// What it was written for, and a black box.
+type Record = (Due, Vec<u8>);
+
 /// The robot of a [`Pair`]: what it reports, tick by tick.
 #[derive(Clone)]
 pub struct Robot {
     reports: Rc<RefCell<Vec<Report>>>,
     notices: Rc<RefCell<Vec<RobotNotice>>>,
-    records: Rc<RefCell<Vec<(Due, Vec<u8>)>>>,
+    records: Rc<RefCell<Vec<Record>>>,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
     endpoint: quinn::Endpoint,
@@ -228,7 +231,7 @@ impl Robot {
     }
 
     /// What its black box has written so far, if the pair was [started with one](Pair::start_recorded).
-    pub fn records(&self) -> std::cell::Ref<'_, Vec<(Due, Vec<u8>)>> {
+    pub fn records(&self) -> std::cell::Ref<'_, Vec<Record>> {
         self.records.borrow()
     }
 
