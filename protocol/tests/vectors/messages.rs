@@ -130,7 +130,7 @@ const STATES: [RobotState; 6] = [
     RobotState::Stopped,
 ];
 
-const CAUSES: [Cause; 11] = [
+const CAUSES: [Cause; 10] = [
     Cause::Requested,
     Cause::NewsArrived,
     Cause::NewsLate,
@@ -141,7 +141,6 @@ const CAUSES: [Cause; 11] = [
     Cause::LocalStop,
     Cause::ClockStep,
     Cause::Fault,
-    Cause::ArmFault,
 ];
 
 const REASONS: [Refusal; 11] = [
@@ -400,6 +399,13 @@ pub(crate) fn messages() -> Vec<Vector> {
         };
         all.push(message(ROBOT_CONTROL, format!("state: {cause:?}"), &m));
     }
+    // Came later: what is drawn for the others stays.
+    let m = RobotControl::State {
+        state: RobotState::Stopped,
+        cause: Cause::ArmFault,
+        changes: 3,
+    };
+    all.push(message(ROBOT_CONTROL, "state: ArmFault", &m));
     for (i, n) in [0, 0, 1, 2, 3, 5, 8, 13, 21, 32].into_iter().enumerate() {
         let m = OperatorDatagram::Motion(motion(draw, n));
         all.push(message(OPERATOR_DATAGRAM, format!("motion {i}"), &m));
