@@ -504,6 +504,7 @@ async fn listen_to(
                 clock,
                 origin,
                 counters,
+                seen,
             } => {
                 let event = Event::Disconnected {
                     why: why.clone(),
@@ -512,6 +513,9 @@ async fn listen_to(
                     clock_offset_s: clock.map(|c| c.0),
                     clock_bound_s: clock.map(|c| c.1),
                     clock_origin: origin.word().to_owned(),
+                    up: seen.up,
+                    down_delay: seen.down,
+                    age: seen.age,
                 };
                 log.say(&event, || {
                     let clock = clock.map_or_else(String::new, |(_, bound_s)| {
@@ -524,9 +528,12 @@ async fn listen_to(
                         };
                         format!("; session clock known to ±{:.2} ms{how}", bound_s * 1e3)
                     });
+                    let age = seen
+                        .age
+                        .map_or_else(String::new, |age| format!("; what was followed was {age} old"));
                     format!(
-                        "session ended: {why}; {} motions, {} dropped{clock}",
-                        counters.received, counters.dropped
+                        "session ended: {why}; motions: {}, {} dropped{age}{clock}",
+                        seen.up, counters.dropped
                     )
                 });
             }

@@ -23,7 +23,7 @@ use crate::door::{self, Door, Place, Verdict};
 use crate::refused::{Reason, Refused, Tally};
 use crate::servo::thread::Timing;
 use crate::servo::{ArmFault, Handle, Order, Report};
-use crate::session::{Counters, Output, Session, SessionConfig, TickTiming};
+use crate::session::{Counters, Output, Seen, Session, SessionConfig, TickTiming};
 
 /// How often reports are taken from the servo's ring.
 const DRAIN: Duration = Duration::from_millis(4);
@@ -98,6 +98,8 @@ pub enum Notice {
         origin: Origin,
         /// What the session counted.
         counters: Counters,
+        /// What became of its datagrams.
+        seen: Seen,
     },
     /// Somebody was turned away: told the first time, and then ever more rarely.
     Refused(Refused),
@@ -232,8 +234,9 @@ impl Daemon {
                         let _ = notices.send(Notice::Pairing(self.desk.open(span)));
                     }
                     Word::Yes | Word::No => {
-                        let told = self.desk.word(word == Word::Yes).map(Notice::Pairing);
-                        told.map(|notice| notices.send(notice));
+                        if let Some(progress) = self.desk.word(word == Word::Yes) {
+                            let _ = notices.send(Notice::Pairing(progress));
+                        }
                     }
                     // What an operator says; a robot's terminal does not know them.
                     Word::Keep | Word::Refine | Word::Save(_) => {}
@@ -287,7 +290,9 @@ impl Daemon {
                         Arrival::Gone => None,
                     };
                     let told = refused.and_then(|(peer, reason, why)| self.refused.count(peer, reason, why));
-                    told.map(|refused| notices.send(Notice::Refused(refused)));
+                    if let Some(refused) = told {
+                        let _ = notices.send(Notice::Refused(refused));
+                    }
                 }
             }
         }
@@ -501,12 +506,13 @@ impl Daemon {
             .to_session(now)
             .zip(clock.uncertainty_s(now))
             .map(|(t, bound_s)| ((t.0 - now.0) as f64 * 1e-9, bound_s));
-        let counters = ended.counters();
+        let (counters, seen) = (ended.counters(), ended.seen());
         let _ = notices.send(Notice::Disconnected {
             why: why.to_owned(),
             clock,
             origin,
             counters,
+            seen,
         });
     }
 }

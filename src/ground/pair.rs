@@ -15,7 +15,7 @@ use telemime_endpoint::{
     External, Fingerprint, HostClock, Identity, IdentityError, Meter, Mono, Trust, quic,
 };
 use telemime_operator::daemon::{
-    Daemon as OperatorDaemon, DaemonError, Learning, Notice as OperatorNotice, Summary,
+    Daemon as OperatorDaemon, DaemonError, Learning, Notice as OperatorNotice, Reopen, Summary,
 };
 use telemime_operator::session::SessionConfig;
 use telemime_operator::task::Task;
@@ -53,6 +53,9 @@ pub enum PairError {
 
 /// Not the robot's clock: the operators' session clock is an hour and a half off.
 const SESSION_ZERO: Mono = Mono(-5_400_000_000_000);
+
+/// Hosts from here on are where operators go whose address has vanished.
+const SPARE: u8 = 128;
 
 fn host(n: u8) -> SocketAddr {
     SocketAddr::new(IpAddr::V4(Ipv4Addr::new(192, 0, 2, n)), 4433)
@@ -109,12 +112,15 @@ pub struct Pair {
     pub learning: Learning,
 }
 
+/// What it was written for, and a black box.
+type Record = (Due, Vec<u8>);
+
 /// The robot of a [`Pair`]: what it reports, tick by tick.
 #[derive(Clone)]
 pub struct Robot {
     reports: Rc<RefCell<Vec<Report>>>,
     notices: Rc<RefCell<Vec<RobotNotice>>>,
-    records: Rc<RefCell<Vec<(Due, Vec<u8>)>>>,
+    records: Rc<RefCell<Vec<Record>>>,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
     endpoint: quinn::Endpoint,
@@ -129,6 +135,8 @@ pub struct Operator {
     pub notices: mpsc::UnboundedReceiver<OperatorNotice>,
     /// Its address.
     pub addr: SocketAddr,
+    /// Where it binds should that one vanish.
+    pub spare: SocketAddr,
     endpoint: quinn::Endpoint,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
@@ -223,7 +231,7 @@ impl Robot {
     }
 
     /// What its black box has written so far, if the pair was [started with one](Pair::start_recorded).
-    pub fn records(&self) -> std::cell::Ref<'_, Vec<(Due, Vec<u8>)>> {
+    pub fn records(&self) -> std::cell::Ref<'_, Vec<Record>> {
         self.records.borrow()
     }
 
@@ -496,8 +504,21 @@ impl Pair {
     ) -> Result<Operator, PairError> {
         let (endpoint, meter) = self.client(identity, &trust, link, seed)?;
         let (endpoint_copy, addr) = (endpoint.clone(), host(1 + self.operators));
+        let spare = host(SPARE + self.operators);
+        let reopen = {
+            let (network, trust, meter) = (self.network.clone(), trust.clone(), meter.clone());
+            let identity = Identity::from_pem(&identity.to_pem())?;
+            Reopen::new(move || {
+                let socket = quic::Socket::Abstract {
+                    socket: network.socket(spare),
+                    seed: [SPARE; 32],
+                };
+                quic::client(&identity, &trust, socket, &meter)
+            })
+        };
         let daemon = OperatorDaemon {
             endpoint,
+            reopen: Some(reopen),
             trust,
             meter,
             robot: host(1),
@@ -521,6 +542,7 @@ impl Pair {
             done,
             notices,
             addr,
+            spare,
             endpoint: endpoint_copy,
             quit,
             words,

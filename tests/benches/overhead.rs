@@ -105,10 +105,13 @@ fn bare_udp() -> Round {
     }
 }
 
+/// Takes a message; says whether it is to be answered.
+type Take = Box<dyn FnMut(&[u8]) -> bool + Send>;
+
 /// What the two ends of a QUIC echo do with a message: what is sent, and whether what has arrived is to be answered.
 struct Ends {
     send: Box<dyn FnMut() -> Vec<u8> + Send>,
-    take: Box<dyn FnMut(&[u8]) -> bool + Send>,
+    take: Take,
 }
 
 fn keys() -> [(Identity, Trust); 2] {
@@ -235,6 +238,7 @@ impl Engaged {
             clock,
         };
         for i in 0..5000 {
+            #[expect(clippy::disallowed_methods, reason = "a bench runs in real time")]
             thread::sleep(Duration::from_millis(1));
             let now = clock.now();
             let sample = HandSample::at(Stamp(now.0), Vector3::new(0.0, 0.0, 2.0));

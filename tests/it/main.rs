@@ -4,6 +4,7 @@
     reason = "clippy.toml allows it in tests, but does not know these helpers for tests"
 )]
 
+mod adapting;
 mod alignment;
 mod arms;
 mod blackbox;

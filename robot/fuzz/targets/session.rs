@@ -103,7 +103,7 @@ impl Bench {
                         self.pings.push(t1_us);
                         self.pings.truncate(8);
                     }
-                    Ok(RobotDatagram::Telemetry(_)) => {}
+                    Ok(RobotDatagram::Telemetry(_) | RobotDatagram::Reception(_)) => {}
                     Err(e) => panic!("{e}"),
                 },
                 Output::Order(order) => self.order(order),

@@ -115,7 +115,7 @@ impl Bench {
             }
             let report = self.station.tick(self.now);
             self.reports.push(report);
-            if self.reports.len() % 50 == 0 {
+            if self.reports.len().is_multiple_of(50) {
                 self.due = self.recorder.drain().or(self.due);
             }
         }

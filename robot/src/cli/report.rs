@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use telemime_endpoint::cli::Printer;
 use telemime_endpoint::pairing::Candidate;
+use telemime_endpoint::reception::{Quantiles, Received};
 
 use crate::blackbox::{Due, Saved};
 use crate::desk::Progress;
@@ -40,6 +41,9 @@ pub enum Event {
         clock_offset_s: Option<f64>,
         clock_bound_s: Option<f64>,
         clock_origin: String,
+        up: Received,
+        down_delay: Option<Quantiles>,
+        age: Option<Quantiles>,
     },
     Refused {
         reason: String,
