@@ -11,7 +11,8 @@ use telemime_sim::link::{
 };
 
 use crate::{
-    arm, codec, demo, evaluate, experiment, ingest, link, paper, recognise, select, tap, teach,
+    arm, codec, demo, evaluate, experiment, ingest, link, paper, recognise, replay, select, tap,
+    teach,
 };
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
@@ -54,6 +55,8 @@ enum Command {
     Operator(Box<telemime_operator::cli::Args>),
     /// The robot daemon: an arm that follows.
     Robot(telemime_robot::cli::Args),
+    /// Run a robot's black box again, and tell what happened.
+    Replay(replay::Args),
     Arm(arm::Args),
     Identity(admin::IdentityArgs),
     Pair(telemime_operator::cli::PairArgs),
@@ -159,6 +162,7 @@ pub fn main() -> ExitCode {
         Some(Command::Tap(args)) => tap::run(args),
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),
+        Some(Command::Replay(args)) => replay::run(args),
         Some(Command::Arm(args)) => arm::run(args),
         Some(Command::Identity(args)) => admin::identity(args, Role::Operator),
         Some(Command::Pair(args)) => telemime_operator::cli::pair(args),

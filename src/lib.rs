@@ -23,6 +23,7 @@ mod paper;
 mod picture;
 mod recognise;
 pub mod relay;
+mod replay;
 mod select;
 mod tap;
 mod teach;

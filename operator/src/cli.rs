@@ -21,7 +21,7 @@ use telemime_endpoint::peers::{Peers, Role, Source, Whom};
 use telemime_endpoint::{External, HostClock, Identity, Meter, Mono, Trust, quic};
 use tokio::sync::mpsc;
 
-use crate::daemon::{Daemon, Learning};
+use crate::daemon::{Daemon, Learning, Reopen};
 use crate::demonstration::{Demonstration, Sample};
 use crate::placed::Motion;
 use crate::session::Leeway;
@@ -90,9 +90,17 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     let meter = Meter::default();
     let socket = quic::Socket::bind(any_port(robot))?;
     let endpoint = quic::client(&identity, &trust, socket, &meter)?;
+    let reopen = {
+        let (trust, meter) = (trust.clone(), meter.clone());
+        Reopen::new(move || {
+            let socket = quic::Socket::bind(any_port(robot))?;
+            quic::client(&identity, &trust, socket, &meter)
+        })
+    };
     let clock = HostClock::new();
     let daemon = Daemon {
         endpoint,
+        reopen: Some(reopen),
         trust: trust.clone(),
         meter,
         robot,

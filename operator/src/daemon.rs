@@ -1,6 +1,7 @@
 //! The operator's shell: dials, redials, feeds the session samples and moves its bytes.
 
 use std::borrow::Cow;
+use std::fmt;
 use std::future::Future;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -12,6 +13,7 @@ use quinn::{Connection, Endpoint, VarInt};
 use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::ControlError;
 use telemime_endpoint::meter::Counts;
+use telemime_endpoint::quic::EndpointError;
 use telemime_endpoint::{
     External, Fingerprint, HostClock, Meter, Mono, Standing, Trust, quic, trust,
 };
@@ -25,17 +27,39 @@ use tokio::time::{sleep_until, timeout};
 use crate::dial::{DialError, Dialler, Link, Seen};
 use crate::lessons::{Lesson, LessonError, Lessons};
 use crate::recognise::Recogniser;
-use crate::session::{Counters, Event, Output, Session, SessionConfig};
+use crate::session::{Counters, Event, Output, Seen as LinkSeen, Session, SessionConfig};
 use crate::task::{Advice, Outcome, Task};
 
 /// A robot that has ended its stream gets this long to say why.
 const LAST_WORDS: Duration = Duration::from_millis(500);
+
+/// Nobody answered for so long: the socket itself may be what is wrong.
+const SOCKET_PATIENCE_S: f64 = 5.0;
+
+/// Makes another endpoint like the first, on a socket of its own.
+#[derive(Clone)]
+pub struct Reopen(Arc<dyn Fn() -> Result<Endpoint, EndpointError> + Send + Sync>);
+
+impl Reopen {
+    /// By calling `open`.
+    pub fn new(open: impl Fn() -> Result<Endpoint, EndpointError> + Send + Sync + 'static) -> Self {
+        Self(Arc::new(open))
+    }
+}
+
+impl fmt::Debug for Reopen {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Reopen")
+    }
+}
 
 /// What the daemon needs.
 #[derive(Debug)]
 pub struct Daemon {
     /// A client endpoint whose default settings trust whom `trust` does.
     pub endpoint: Endpoint,
+    /// How to get another, should its socket fail or its address vanish, as it may when a laptop changes networks.
+    pub reopen: Option<Reopen>,
     /// The robot's key, and whether it still is trusted.
     pub trust: Trust,
     /// Counts the endpoint's traffic.
@@ -125,6 +149,8 @@ pub struct Summary {
     pub engaged: Counts,
     /// Sessions begun.
     pub sessions: u32,
+    /// What became of the datagrams of the last session in which something was driven.
+    pub seen: LinkSeen,
 }
 
 /// Something for a log or a progress bar.
@@ -205,7 +231,7 @@ impl Console<'_> {
                         "there is no link: the emergency stop is the first thing the robot will hear"
                     }
                     Word::Reset => "there is no link: the reset is discarded",
-                    Word::Pair(_) | Word::Yes | Word::No => NOT_HERE,
+                    Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => NOT_HERE,
                     Word::Keep | Word::Refine | Word::Save(_) => {
                         "there is no link: say it again when it is back"
                     }
@@ -244,12 +270,14 @@ impl Daemon {
             total: Counts::default(),
             engaged: Counts::default(),
             sessions: 0,
+            seen: LinkSeen::default(),
         };
         let mut marks = Marks::default();
         let mut lessons = Lessons::new(self.skill.clone());
         // Demanded, and not confirmed by the robot: outlives the session it was demanded in.
         let mut stop = false;
         let mut seen = None;
+        let mut endpoint = self.endpoint.clone();
         loop {
             let mut hung_up = quit.clone();
             let mut console = Console {
@@ -260,10 +288,10 @@ impl Daemon {
             let link = tokio::select! {
                 biased;
                 () = told(&mut hung_up) => break,
-                link = self.dial(seen, task, &mut console, &mut stop) => link?,
+                link = self.dial(&mut endpoint, seen, task, &mut console, &mut stop) => link?,
             };
             let Some(link) = link else { break };
-            let (mut last, connection) = (link.seen(), link.connection.clone());
+            let mut last = link.seen();
             summary.sessions += 1;
             let _ = notices.send(Notice::Connected {
                 epoch: link.epoch,
@@ -277,13 +305,22 @@ impl Daemon {
                 session.stop(self.now());
             }
             let end = self
-                .drive(&mut session, link, task, console, &mut marks, &mut lessons)
+                .drive(
+                    (&mut session, &mut last),
+                    link,
+                    task,
+                    console,
+                    &mut marks,
+                    &mut lessons,
+                )
                 .await;
-            last.rtt = connection.rtt();
-            drop(connection);
             seen = Some(last);
             stop = session.stop_is_unconfirmed();
             summary.counters.add(session.counters());
+            let of_link = session.seen();
+            if of_link.up.is_some() || summary.seen.up.is_none() {
+                summary.seen = of_link;
+            }
             match end {
                 End::Finished | End::Quit => break,
                 End::Lost(why) => {
@@ -296,7 +333,7 @@ impl Daemon {
             let lesson = lessons.finished().await;
             self.learned(lesson, &lessons, notices);
         }
-        self.endpoint.wait_idle().await;
+        endpoint.wait_idle().await;
         summary.outcome = task.outcome(*quit.borrow());
         if stop {
             summary.outcome = Outcome::Interrupted(
@@ -321,14 +358,15 @@ impl Daemon {
     /// `seen` is what the last session's link was like, if there was one.
     async fn dial(
         &self,
+        endpoint: &mut Endpoint,
         seen: Option<Seen>,
         task: &Task,
         console: &mut Console<'_>,
         stop: &mut bool,
     ) -> Result<Option<Link>, DaemonError> {
         let (begun, first, addr) = (self.now(), seen.is_none(), self.robot);
-        let mut dialler = Dialler::new(&self.endpoint, addr, self.config.versions, seen);
-        let mut said = None;
+        let mut dialler = Dialler::new(endpoint, addr, self.config.versions, seen);
+        let (mut said, mut bound) = (None, begun);
         loop {
             let outcome = console.beside(stop, dialler.next()).await;
             let patient = self.now().secs_since(begun) <= self.patience.as_secs_f64();
@@ -336,6 +374,10 @@ impl Daemon {
                 Some(Ok(link)) => return Ok(Some(link)),
                 None => None,
                 Some(Err(DialError::Again(why))) => Some(why),
+                Some(Err(DialError::NoSocket)) => {
+                    bound = Stamp(i64::MIN);
+                    Some("our socket has failed".into())
+                }
                 // An operator that lost its link, or comes back, may find its own old session still in authority.
                 Some(Err(DialError::Rejected {
                     code: RejectCode::Busy,
@@ -355,6 +397,19 @@ impl Daemon {
                 }
                 Some(Err(DialError::Revoked)) => return Err(DaemonError::Revoked { addr }),
             };
+            if self.now().secs_since(bound) > SOCKET_PATIENCE_S
+                && (!first || bound.0 == i64::MIN)
+                && let Some(reopen) = &self.reopen
+            {
+                bound = self.now();
+                match (reopen.0)() {
+                    Ok(other) => {
+                        *endpoint = other;
+                        dialler.move_to(endpoint);
+                    }
+                    Err(e) => console.note(format!("no other socket to be had: {e}")),
+                }
+            }
             if first && !patient {
                 let why = why.or(said);
                 let why = why.unwrap_or_else(|| "no answer".into());
@@ -373,7 +428,7 @@ impl Daemon {
 
     async fn drive(
         &self,
-        session: &mut Session,
+        (session, seen): (&mut Session, &mut Seen),
         mut link: Link,
         task: &mut Task,
         console: Console<'_>,
@@ -460,7 +515,7 @@ impl Daemon {
                     Word::Stop => session.stop(self.now()),
                     Word::Reset if session.reset() => {}
                     Word::Reset => console.note("the reset is discarded: the robot has not confirmed the stop yet"),
-                    Word::Pair(_) | Word::Yes | Word::No => console.note(NOT_HERE),
+                    Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => console.note(NOT_HERE),
                     word @ (Word::Keep | Word::Refine | Word::Save(_)) => {
                         let said = self.lesson(&word, session, lessons, notices);
                         if let Err(e) = said {
@@ -484,6 +539,7 @@ impl Daemon {
                 },
                 datagram = link.connection.read_datagram() => match datagram {
                     Ok(bytes) => {
+                        seen.learn(&link.connection);
                         session.set_external(self.external.as_ref().map(|e| e.message(self.epoch)));
                         session.handle_datagram(self.now(), &bytes);
                     }
@@ -522,7 +578,7 @@ impl Daemon {
                 lessons.save(file)?;
                 let _ = notices.send(Notice::Saved(file.clone()));
             }
-            Word::Stop | Word::Reset | Word::Pair(_) | Word::Yes | Word::No => {}
+            Word::Stop | Word::Reset | Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => {}
         }
         Ok(())
     }

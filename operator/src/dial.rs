@@ -8,24 +8,27 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use quinn::{Connecting, Connection, Endpoint};
+use quinn::{ConnectError, Connecting, Connection, Endpoint};
 use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::quic::{self, Refusal};
-use telemime_protocol::wire::frame::Frame;
+use telemime_protocol::wire::frame::{self, Frame};
 use telemime_protocol::wire::hello::{Answer, RejectCode};
 use telemime_protocol::wire::{Version, Versions};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until, timeout};
 
-/// Attempts begin this far apart.
+/// Attempts begin this far apart …
 pub const REDIAL: Duration = Duration::from_millis(250);
+
+/// … and the first ones, of which nobody knows what the link carries, this.
+const FIRST_REDIAL: Duration = Duration::from_millis(500);
 
 /// Attempts begin this many times as far apart as the first packets' own length took on the last link, if that is
 /// more; but no farther than [`SLOWEST_REDIAL`]. Each is two packets of 1.2 kB: on 64 kbit/s, four a second would fill a
 /// queue for ever.
 const LENGTHS: u32 = 3;
-const SLOWEST_REDIAL: Duration = Duration::from_secs(1);
+const SLOWEST_REDIAL: Duration = Duration::from_secs(2);
 
 /// An attempt is given at least this long, and at least this many of the round trips last seen.
 const LEAST_ATTEMPT: Duration = Duration::from_millis(500);
@@ -37,6 +40,10 @@ const UNDISTURBED: Duration = Duration::from_secs(2);
 
 /// The longest time-out of an attempt.
 const LONGEST_ATTEMPT: Duration = Duration::from_secs(10);
+
+/// No answer to our greeting for so long: it may have overtaken the handshake's last packets, and is then thrown away. QUIC says
+/// it again after three round trips, or one if something later has arrived.
+const NUDGE: Duration = Duration::from_millis(30);
 
 /// Application close code of a robot that does not trust our key (docs/protocol.md §1).
 const NOT_TRUSTED: u32 = 5;
@@ -56,16 +63,24 @@ impl Link {
     /// What is to be known of the link, once it is lost.
     pub(crate) fn seen(&self) -> Seen {
         Seen {
-            rtt: self.connection.rtt(),
+            rtt: quic::least_rtt(&self.connection),
             answered: self.answered,
         }
+    }
+}
+
+impl Seen {
+    /// The least round trip counts: what a queue adds is no part of the path, and would have attempts wait for it.
+    pub(crate) fn learn(&mut self, connection: &Connection) {
+        self.rtt = self.rtt.min(quic::least_rtt(connection));
     }
 }
 
 /// What the last link was like.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Seen {
-    pub(crate) rtt: Duration,
+    /// The least.
+    rtt: Duration,
     answered: Duration,
 }
 
@@ -74,6 +89,8 @@ pub(crate) struct Seen {
 pub(crate) enum DialError {
     /// The next one may.
     Again(String),
+    /// None can any more: the endpoint has lost its socket.
+    NoSocket,
     /// The robot declines.
     Rejected { code: RejectCode, text: String },
     /// The robot's key is not the one that is pinned.
@@ -100,9 +117,10 @@ impl Pace {
             let lengths = seen.answered.saturating_sub(seen.rtt);
             (seen.rtt * ROUND_TRIPS + lengths, lengths)
         });
+        let least = seen.map_or(FIRST_REDIAL, |_| REDIAL);
         let brisk = brisk.clamp(LEAST_ATTEMPT, LONGEST_ATTEMPT);
         Self {
-            apart: (lengths * LENGTHS).clamp(REDIAL, SLOWEST_REDIAL),
+            apart: (lengths * LENGTHS).clamp(least, SLOWEST_REDIAL),
             brisk,
             patient: brisk,
         }
@@ -144,6 +162,13 @@ impl Dialler {
             answered_tx: watch::Sender::new(None),
             next: Instant::now(),
         }
+    }
+
+    /// Attempts begin at `endpoint` from now on, at once; those under way go on where they began.
+    pub(crate) fn move_to(&mut self, endpoint: &Endpoint) {
+        self.endpoint = endpoint.clone();
+        self.answered_tx.send_replace(None);
+        self.next = Instant::now();
     }
 
     /// The outcome of an attempt; `None` when a new one has begun instead, so that the caller looks up from time
@@ -188,9 +213,10 @@ async fn attempt(
     answered: watch::Sender<Option<Instant>>,
 ) -> Result<Link, DialError> {
     let begun = Instant::now();
-    let mut connecting = endpoint
-        .connect(robot, "telemime")
-        .map_err(|e| DialError::Again(e.to_string()))?;
+    let mut connecting = endpoint.connect(robot, "telemime").map_err(|e| match e {
+        ConnectError::EndpointStopping => DialError::NoSocket,
+        e => DialError::Again(e.to_string()),
+    })?;
     let silent =
         |_| DialError::Again("no answer: is the robot running, and does UDP reach it?".to_owned());
     let answer = timeout(within, connecting.handshake_data()).await;
@@ -217,7 +243,15 @@ async fn connect(
     let mut control = Control::open(&connection).await.map_err(again)?;
     let hello = offered.hello().encode();
     control.write(&hello).await.map_err(again)?;
-    match control.answer().await.map_err(again)? {
+    let answer = match timeout(NUDGE, control.answer()).await {
+        Ok(answer) => answer,
+        Err(_) => {
+            let nothing = frame::encode(&[], true);
+            control.write(&nothing).await.map_err(again)?;
+            control.answer().await
+        }
+    };
+    match answer.map_err(again)? {
         Answer::Ack { version, epoch, .. } => {
             let Some(version) = offered.known(version) else {
                 return Err(DialError::Rejected {
@@ -273,7 +307,8 @@ mod tests {
                 answered: ms(rtt + 20),
             };
             let mut pace = Pace::new(rtt.map(seen));
-            assert_eq!(pace.apart, REDIAL, "{rtt:?}");
+            let apart = rtt.map_or(FIRST_REDIAL, |_| REDIAL);
+            assert_eq!(pace.apart, apart, "{rtt:?}");
             assert_eq!(pace.brisk, ms(brisk), "{rtt:?}");
             let mut due = brisk;
             for _ in 0..8 {
@@ -287,7 +322,7 @@ mod tests {
     #[test]
     fn on_a_thin_link_attempts_are_farther_apart() {
         let ms = Duration::from_millis;
-        for (answered, apart) in [(180, 250), (300, 600), (3_000, 1_000)] {
+        for (answered, apart) in [(180, 250), (300, 600), (3_000, 2_000)] {
             let seen = Seen {
                 rtt: ms(100),
                 answered: ms(answered),

@@ -318,6 +318,21 @@ fn robot_datagrams() {
             "0101020203fc0ead2500fb50c36e69fafbfb00fbfc000405fb7017fc70110100060000003f000000 \
              00000000bffafbfb000001ff020000803f000000c0",
         ),
+        (
+            RobotDatagram::Reception(Reception {
+                epoch: 1,
+                newest_seq: 252,
+                received: 250,
+                duplicates: 1,
+                reordered: 3,
+                loss_runs: 2,
+                longest_loss_run: 1,
+                jitter_us: 4_000,
+                delay_us: [100_000, 99_000, 110_000, 65_536],
+                age_us: [180_000, 0, 250, 251],
+            }),
+            "0201fbfc00fa01030201fba00ffca0860100fcb8820100fcb0ad0100fc00000100fc20bf020000fafbfb00",
+        ),
     ]);
 }
 
@@ -343,6 +358,7 @@ fn enumerations() {
         Cause::LocalStop,
         Cause::ClockStep,
         Cause::Fault,
+        Cause::ArmFault,
     ];
     let refusals = [
         Refusal::Stopped,

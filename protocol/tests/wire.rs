@@ -160,6 +160,7 @@ fn cause() -> impl Strategy<Value = Cause> {
         Cause::LocalStop,
         Cause::ClockStep,
         Cause::Fault,
+        Cause::ArmFault,
     ])
 }
 
@@ -438,6 +439,22 @@ fn robot_datagram() -> impl Strategy<Value = RobotDatagram> {
         (any::<u32>(), any::<i64>())
             .prop_map(|(epoch, t1_us)| RobotDatagram::Ping { epoch, t1_us }),
         telemetry,
+        (any::<[u32; 8]>(), any::<[u32; 4]>(), any::<[u32; 4]>()).prop_map(
+            |(n, delay_us, age_us)| {
+                RobotDatagram::Reception(Reception {
+                    epoch: n[0],
+                    newest_seq: n[1],
+                    received: n[2],
+                    duplicates: n[3],
+                    reordered: n[4],
+                    loss_runs: n[5],
+                    longest_loss_run: n[6],
+                    jitter_us: n[7],
+                    delay_us,
+                    age_us,
+                })
+            }
+        ),
     ]
 }
 

@@ -52,6 +52,7 @@ fn run(what: &str, scale: f64, barrier: BarrierConfig) {
     core.tick(now);
     order(Order::Engage(Engagement {
         ticket,
+        model: None,
         source: Source::Mirror {
             forecast: forecast(now),
             valid_at: now,

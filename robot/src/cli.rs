@@ -9,7 +9,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use serde::Deserialize;
 use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
@@ -18,17 +18,22 @@ use telemime_endpoint::peers::{Role, Source, Whom};
 use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Trust, quic};
 use telemime_sim::arm::{LoadOptions, Payload};
 use telemime_sim::link::parse_duration_s;
+use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
+use crate::blackbox::{Header, Keeper, Recorder, SPAN_S, Saved, taps};
 use crate::clock::Origin;
 use crate::control::ControlConfig;
-use crate::daemon::{Daemon, Notice};
+use crate::daemon::{Daemon, Failure, Notice};
 use crate::desk::Desk;
+use crate::driver::PATIENCE_S;
+use crate::driver::bridge::{Bridge, Words};
 use crate::refused::Refused;
 use crate::rig::{Rig, RigOptions};
-use crate::servo::{self, Ticket};
+use crate::servo::thread::Servo;
+use crate::servo::{self, Priority, Ticket};
 use crate::session::SessionConfig;
-use record::Recorder;
+use record::TickRecorder;
 pub use report::Event;
 use report::{Log, engaged, nth};
 
@@ -36,7 +41,7 @@ use report::{Log, engaged, nth};
 ///
 /// Nobody is let in whose key is not known: pair an operator (--pair, or pair on the terminal, and `telemime pair`
 /// at the operator), or give the fingerprint it prints with --peer. On the terminal, type stop (emergency stop,
-/// latched), reset, pair, yes, no or quit.
+/// latched; SIGUSR1 does the same), reset, blackbox, pair, yes, no or quit.
 #[derive(clap::Args, Debug, Clone, Default)]
 pub struct Args {
     /// Read settings from this TOML file; flags override it.
@@ -105,6 +110,19 @@ pub struct Args {
     /// Write every tick to this CSV file.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
+    /// Drive a real arm: this command (run by sh) tells its joints' state and takes setpoints, a JSON line each; docs/driver.md.
+    #[arg(long, value_name = "COMMAND", conflicts_with = "start")]
+    pub driver: Option<String>,
+    /// The driver may be silent, or behind its setpoints, for this long before the arm is stopped [default: 100ms].
+    #[arg(long, value_name = "TIME", value_parser = parse_duration_s)]
+    pub driver_patience: Option<f64>,
+    /// Run the servo at this real-time priority, 1 to 99 [50 if nothing is said], and lock memory, where the system allows it.
+    #[arg(long, value_name = "PRIO", num_args = 0..=1, default_missing_value = "50")]
+    pub realtime: Option<u8>,
+    /// Keep the last two minutes of all that the servo is told and decides, and write them to this folder at every stop or
+    /// fault, on `blackbox` or on SIGUSR2; `telemime replay` reads them.
+    #[arg(long, value_name = "DIR")]
+    pub black_box: Option<PathBuf>,
     /// Print events as JSON lines on stdout.
     #[arg(long)]
     pub json: bool,
@@ -142,6 +160,10 @@ struct File {
     bandwidth_rad_s: Option<f64>,
     protocol_max: Option<u16>,
     record: Option<PathBuf>,
+    driver: Option<String>,
+    driver_patience_s: Option<f64>,
+    realtime: Option<u8>,
+    black_box: Option<PathBuf>,
 }
 
 /// `JOINT=VALUE` as a joint's name and its value, rad or m.
@@ -207,6 +229,25 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let mut desk = Desk::new(own, trust.clone(), Some(source.path.clone())).expecting(expected);
     let mut fixed = file.fixed;
     fixed.extend(args.fixed.iter().cloned());
+    let driver = args.driver.clone().or(file.driver);
+    let mut bridge = driver.as_deref().map(Bridge::start).transpose()?;
+    let patience_s = args
+        .driver_patience
+        .or(file.driver_patience_s)
+        .unwrap_or(PATIENCE_S);
+    anyhow::ensure!(
+        (0.01..=10.0).contains(&patience_s),
+        "--driver-patience {patience_s} s: from 10ms to 10s"
+    );
+    let priority = args.realtime.or(file.realtime);
+    let priority = priority.map(Priority::new).transpose()?;
+    let start = match &bridge {
+        Some(bridge) if file.start.is_none() => Some(bridge.posture()),
+        Some(_) => {
+            bail!("start and driver: an arm behind a driver starts where it is; leave one out")
+        }
+        None => args.start.clone().or(file.start),
+    };
     let options = RigOptions {
         urdf: args.urdf.clone().or(file.urdf),
         load: LoadOptions {
@@ -215,7 +256,8 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
             payload,
         },
         contact,
-        start: args.start.clone().or(file.start),
+        start,
+        driver: bridge.is_some(),
         control: ControlConfig {
             dead_time_s: args.dead_time.or(file.dead_time_s).unwrap_or(0.0),
             omega: args
@@ -227,7 +269,12 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         },
         ..RigOptions::default()
     };
-    let rig = Rig::load(&options)?;
+    let (urdf, text) = Rig::text(options.urdf.as_deref())?;
+    if let Some(bridge) = &bridge {
+        // Before the posture is looked at: it is one of the driver's joints.
+        bridge.fits(&Rig::arm(&urdf, &text, &options)?)?;
+    }
+    let rig = Rig::read(urdf, &text, &options)?;
     // Of our own arm there is nothing to tell.
     if options.urdf.is_some() {
         for notice in rig.arm.notices() {
@@ -238,7 +285,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         .record
         .clone()
         .or(file.record)
-        .map(|path| Recorder::start(&path, rig.arm.dof()))
+        .map(|path| TickRecorder::start(&path, rig.arm.dof()))
         .transpose()?;
     let listen = args
         .listen
@@ -261,16 +308,45 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let endpoint = quic::server(&identity, &trust, socket, &Meter::default())?;
     let addr = endpoint.local_addr()?;
     let (rings, handle) = servo::rings();
-    let running = servo::thread::Servo::start(rig.servo(rings)).context("no servo thread")?;
-    let brake = handle.brake.clone();
-    let (quit, words) = cli::listen(args.follow_stdin, cli::ROBOT_WORDS, move || {
-        brake.stop_here()
-    })?;
+    let mut station = match &mut bridge {
+        Some(bridge) => {
+            let arm = bridge.arm(rig.arm.clone(), patience_s)?;
+            rig.servo_before(Box::new(arm), bridge.state.opening, rings)
+        }
+        None => rig.servo(rings),
+    };
     let (out, printing) = Printer::start().context("no thread to print from")?;
     let log = Log {
         json: args.json,
         out,
     };
+    let keeper = match args.black_box.clone().or(file.black_box) {
+        Some(dir) => {
+            // Better now than after the stop that it was for.
+            std::fs::create_dir_all(&dir)
+                .and_then(|()| tempfile::tempfile_in(&dir))
+                .with_context(|| format!("--black-box {} cannot be written", dir.display()))?;
+            let (tap, feed) = taps(&station.room());
+            station = station.recorded(tap);
+            let recorder = Recorder::new(Header::new(&rig, driver.clone()), feed, SPAN_S);
+            let log = log.clone();
+            let say = move |due, saved: Saved| log.black_box(due, &saved);
+            Some(Keeper::start(recorder, &dir, say).context("no thread for the black box")?)
+        }
+        None => None,
+    };
+    let asker = keeper.as_ref().map(Keeper::asker);
+    let running = Servo::start(station, priority).context("no servo thread")?;
+    let (brake, by_signal) = (handle.brake.clone(), handle.brake.clone());
+    on_signal(SignalKind::user_defined1(), move || by_signal.stop_here())?;
+    let by_signal = asker.clone();
+    on_signal(SignalKind::user_defined2(), move || match &by_signal {
+        Some(asker) => asker.ask(),
+        None => eprintln!("note: SIGUSR2, but there is no black box: give --black-box DIR"),
+    })?;
+    let (quit, words) = cli::listen(args.follow_stdin, cli::ROBOT_WORDS, move || {
+        brake.stop_here()
+    })?;
     log.say(
         &Event::Listening {
             addr,
@@ -290,6 +366,17 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
             )
         },
     );
+    if let Some(Bridge { command, hello, .. }) = &bridge {
+        let event = Event::Driver {
+            command: command.clone(),
+            joints: hello.joints.clone(),
+            rate_hz: hello.rate_hz,
+        };
+        log.say(&event, || format!("driver {command}, {} Hz", hello.rate_hz));
+    }
+    if let Some(granted) = &running.realtime {
+        log.realtime(granted);
+    }
     if let Some(span) = args.pair {
         log.pairing(&desk.open(span));
     }
@@ -305,38 +392,48 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         Some(running.timing.clone()),
         desk,
     );
-    let daemon = daemon.with_external(dispersion.map(External::host));
+    let daemon = daemon
+        .with_external(dispersion.map(External::host))
+        .with_black_box(asker);
     let (notices, heard) = mpsc::unbounded_channel();
-    let listener = tokio::spawn(listen_to(heard, log.clone(), recorder));
+    let listener = tokio::spawn(listen_to(
+        heard,
+        log.clone(),
+        recorder,
+        bridge.as_ref().map(Bridge::words),
+    ));
     let served = tokio::select! {
         served = daemon.run(quit, words, notices) => served,
         () = source.follow(&trust, |e| eprintln!("note: {e}; whoever was trusted still is")) => Ok(()),
     };
     let recorder = listener.await.context("the log ended early")?;
-    let (ticks, mean_ns, p99_ns, overruns) = running.timing.read();
-    // The servo outlives everything that could still ask for motion; it ends at rest.
+    let timing = running.timing.clone();
+    // The servo outlives everything that could still ask for motion; it ends at rest, and after it its driver and its record.
     drop(running);
-    log.say(
-        &Event::Servo {
-            ticks,
-            mean_ns,
-            p99_ns,
-            overruns,
-        },
-        || {
-            format!(
-                "servo: {ticks} ticks, {:.1} µs mean, {:.1} µs p99, {overruns} late",
-                f64::from(mean_ns) * 1e-3,
-                f64::from(p99_ns) * 1e-3
-            )
-        },
-    );
+    let words = bridge.as_ref().map(Bridge::words);
+    drop(bridge);
+    drop(keeper);
+    log.servo(&timing.read());
     drop(log);
     printing.finish();
     if let Some(recorder) = recorder {
         recorder.finish()?;
     }
-    Ok(served?)
+    match (served, words.and_then(|words| words.get())) {
+        (Err(failure @ Failure::Arm(_)), Some(words)) => bail!("{failure}: {words}"),
+        (served, _) => Ok(served?),
+    }
+}
+
+/// Calls `then` on every signal of that kind.
+fn on_signal(kind: SignalKind, then: impl Fn() + Send + 'static) -> anyhow::Result<()> {
+    let mut signals = signal(kind).context("signals cannot be caught")?;
+    tokio::spawn(async move {
+        while signals.recv().await.is_some() {
+            then();
+        }
+    });
+    Ok(())
 }
 
 fn read_config(path: &Path) -> anyhow::Result<File> {
@@ -348,14 +445,23 @@ fn read_config(path: &Path) -> anyhow::Result<File> {
 async fn listen_to(
     mut heard: mpsc::UnboundedReceiver<Notice>,
     log: Log,
-    mut recorder: Option<Recorder>,
-) -> Option<Recorder> {
+    mut recorder: Option<TickRecorder>,
+    words: Option<Words>,
+) -> Option<TickRecorder> {
     let (mut transitions, mut engagement) = (None, Ticket::default());
+    let mut faulty = false;
     while let Some(notice) = heard.recv().await {
         match notice {
             Notice::Report(report) => {
                 if let Some(recorder) = &mut recorder {
                     recorder.take(&report);
+                }
+                if let Some(fault) = report.fault.filter(|_| !faulty) {
+                    faulty = true;
+                    let words = words.as_ref().and_then(Words::get);
+                    let why = words.map_or_else(|| fault.to_string(), |w| format!("{fault}: {w}"));
+                    let text = format!("the arm: {why}");
+                    log.say(&Event::ArmFault { fault, why }, || text);
                 }
                 if transitions != Some(report.transitions) {
                     transitions = Some(report.transitions);
@@ -398,6 +504,7 @@ async fn listen_to(
                 clock,
                 origin,
                 counters,
+                seen,
             } => {
                 let event = Event::Disconnected {
                     why: why.clone(),
@@ -406,6 +513,9 @@ async fn listen_to(
                     clock_offset_s: clock.map(|c| c.0),
                     clock_bound_s: clock.map(|c| c.1),
                     clock_origin: origin.word().to_owned(),
+                    up: seen.up,
+                    down_delay: seen.down,
+                    age: seen.age,
                 };
                 log.say(&event, || {
                     let clock = clock.map_or_else(String::new, |(_, bound_s)| {
@@ -418,9 +528,12 @@ async fn listen_to(
                         };
                         format!("; session clock known to ±{:.2} ms{how}", bound_s * 1e3)
                     });
+                    let age = seen
+                        .age
+                        .map_or_else(String::new, |age| format!("; what was followed was {age} old"));
                     format!(
-                        "session ended: {why}; {} motions, {} dropped{clock}",
-                        counters.received, counters.dropped
+                        "session ended: {why}; motions: {}, {} dropped{age}{clock}",
+                        seen.up, counters.dropped
                     )
                 });
             }

@@ -1,6 +1,6 @@
 //! An arm, ready to be driven: model, start posture, limits, controller and plant.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use telemime_protocol::wire::v1::{Info, RobotState};
@@ -10,7 +10,9 @@ use telemime_sim::arm::{
 
 use crate::control::{ControlConfig, ControlError, Controller, home_posture, workspace_radius};
 use crate::safety::SafetyConfig;
-use crate::servo::{Core, CoreConfig, Rings, Workspace};
+use crate::servo::{
+    Core, CoreConfig, Manipulator, Rings, SimulatedArm, Station, Trajectory, Workspace,
+};
 
 /// A workspace with a smaller radius is refused, m.
 const LEAST_RADIUS_M: f64 = 0.01;
@@ -28,6 +30,8 @@ pub struct RigOptions {
     pub control: ControlConfig,
     /// The state machine's settings.
     pub safety: SafetyConfig,
+    /// The arm is behind a driver: its dead time is its own and not simulated, and an engage begins at the setpoint it holds.
+    pub driver: bool,
     /// A surface that the simulated tip may touch.
     pub contact: Option<ContactPlane>,
 }
@@ -95,6 +99,7 @@ pub struct Rig {
     controller: Controller,
     plant: Plant,
     config: CoreConfig,
+    made_of: Arc<(String, String, RigOptions)>,
 }
 
 impl Rig {
@@ -103,20 +108,42 @@ impl Rig {
     /// # Errors
     /// [`RigError`].
     pub fn load(options: &RigOptions) -> Result<Self, RigError> {
-        let (urdf, text) = match &options.urdf {
-            None => ("the built-in arm".to_owned(), default_urdf().to_owned()),
-            Some(path) => {
-                let text = std::fs::read_to_string(path).map_err(|source| RigError::Io {
-                    path: path.clone(),
-                    source,
-                })?;
-                (path.display().to_string(), text)
-            }
+        let (urdf, text) = Self::text(options.urdf.as_deref())?;
+        Self::read(urdf, &text, options)
+    }
+
+    /// What an URDF is called, and its text; that of the built-in arm without a path.
+    ///
+    /// # Errors
+    /// [`RigError::Io`].
+    pub fn text(urdf: Option<&Path>) -> Result<(String, String), RigError> {
+        let Some(path) = urdf else {
+            return Ok(("the built-in arm".to_owned(), default_urdf().to_owned()));
         };
-        let arm = ArmModel::from_urdf(&text, &options.load).map_err(|source| RigError::Arm {
-            urdf: urdf.clone(),
+        let text = std::fs::read_to_string(path).map_err(|source| RigError::Io {
+            path: path.to_owned(),
             source,
         })?;
+        Ok((path.display().to_string(), text))
+    }
+
+    /// The arm alone, of the `text` of an URDF that is called `urdf`.
+    ///
+    /// # Errors
+    /// [`RigError::Arm`].
+    pub fn arm(urdf: &str, text: &str, options: &RigOptions) -> Result<ArmModel, RigError> {
+        ArmModel::from_urdf(text, &options.load).map_err(|source| RigError::Arm {
+            urdf: urdf.to_owned(),
+            source,
+        })
+    }
+
+    /// As [`Rig::load`], from the `text` of an URDF that is called `urdf`; `options.urdf` is not looked at.
+    ///
+    /// # Errors
+    /// [`RigError`].
+    pub fn read(urdf: String, text: &str, options: &RigOptions) -> Result<Self, RigError> {
+        let arm = Self::arm(&urdf, text, options)?;
         let home = match &options.start {
             None => home_posture(&arm),
             Some(q) => arm.posture(q).ok_or_else(|| RigError::Start {
@@ -125,12 +152,14 @@ impl Rig {
             })?,
         };
         let arm = Arc::new(arm);
+        let mut control = options.control;
+        if options.driver {
+            control.dead_time_s = 0.0;
+        }
         let controller =
-            Controller::new(arm.clone(), &options.control, &home).map_err(|source| {
-                RigError::Control {
-                    urdf: urdf.clone(),
-                    source,
-                }
+            Controller::new(arm.clone(), &control, &home).map_err(|source| RigError::Control {
+                urdf: urdf.clone(),
+                source,
             })?;
         let radius_m = workspace_radius(&arm, &home);
         if radius_m < LEAST_RADIUS_M {
@@ -143,8 +172,9 @@ impl Rig {
         let config = CoreConfig {
             safety: options.safety,
             tick_s: options.control.dt_s,
-            lag_s: controller.lag_s(),
+            lag_s: controller.lag_s() + options.control.dead_time_s - control.dead_time_s,
             workspace,
+            from_setpoint: options.driver,
         };
         Ok(Self {
             plant: Plant::new(arm.clone(), &home)?.beside(options.contact),
@@ -153,7 +183,14 @@ impl Rig {
             workspace,
             controller,
             config,
+            made_of: Arc::new((urdf, text.to_owned(), options.clone())),
         })
+    }
+
+    /// What it was made of: what the URDF is called, its text, and the options.
+    pub fn made_of(&self) -> (&str, &str, &RigOptions) {
+        let (urdf, text, options) = &*self.made_of;
+        (urdf, text, options)
     }
 
     /// What the operator is told.
@@ -190,15 +227,28 @@ impl Rig {
         self.config.lag_s
     }
 
-    /// A servo at rest at the start posture.
-    pub fn servo(&self, rings: Rings) -> Core {
-        Core::new(
-            self.config,
-            self.controller.clone(),
-            self.plant.clone(),
-            Gripper::default(),
-            rings,
-        )
+    /// A core at rest at the start posture; what it no longer needs goes into `spent`.
+    pub fn core(&self, opening: f64, spent: rtrb::Producer<Arc<Trajectory>>) -> Core {
+        Core::new(self.config, self.controller.clone(), opening, spent)
+    }
+
+    /// A servo at rest at the start posture, before the simulated arm.
+    pub fn servo(&self, rings: Rings) -> Station {
+        let gripper = Gripper::default();
+        let opening = gripper.opening();
+        let arm = SimulatedArm::new(self.plant.clone(), gripper);
+        self.servo_before(Box::new(arm), opening, rings)
+    }
+
+    /// A servo at rest before `arm`, which is in the start posture and whose gripper is open as far as `opening`.
+    pub fn servo_before(&self, arm: Box<dyn Manipulator>, opening: f64, rings: Rings) -> Station {
+        let Rings {
+            orders,
+            reports,
+            spent,
+            brake,
+        } = rings;
+        Station::new(self.core(opening, spent), arm, orders, reports, brake)
     }
 }
 

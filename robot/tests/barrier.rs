@@ -1,4 +1,8 @@
 //! Whatever is asked for, the arm does not meet itself, and its tip stays on its side of every plane.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy.toml allows it in tests, but does not know these helpers for tests"
+)]
 
 use std::sync::Arc;
 
@@ -126,8 +130,8 @@ fn attack(seed: u64, minutes: f64, barrier: BarrierConfig, simulated: bool) -> L
             plant.step(&out.tau, DT_S);
             (q, qd) = (*plant.q(), *plant.qd());
         } else {
-            qd = (out.q_ref - q) / DT_S;
-            q = out.q_ref;
+            qd = (out.setpoint.q - q) / DT_S;
+            q = out.setpoint.q;
         }
         kinematics.update(&arm, &q);
         hulls.place(&kinematics);

@@ -26,9 +26,9 @@ use telemime_robot::rig::{Rig, RigOptions};
 
 use crate::cli::Shape;
 use arm::Drive;
+use dual::Scheme;
 pub(crate) use kalman::Kalman;
 pub(crate) use live::{Live, on_session_clock};
-use dual::Scheme;
 use protocol::{Plan, Protocol};
 
 /// Bounds on the future that are tried, as shares of what holding errs by …

@@ -102,7 +102,7 @@ pub(super) const FACTORS: [Factor; 16] = [
     ),
     factor(
         "bandwidth",
-        &["45"],
+        &["40"],
         "of the filter before the arm, rad/s",
         ALL,
     ),

@@ -196,6 +196,8 @@ impl Sender {
 
 #[cfg(test)]
 mod tests {
+    use telemime_operator::demonstration::Demonstration;
+
     use super::*;
 
     fn samples(rate: f64) -> Vec<Sample> {
@@ -217,7 +219,8 @@ mod tests {
         ] {
             let method: Method = text.parse().unwrap();
             assert_eq!(method.to_string(), text);
-            let mut sender = Sender::new(method, &Kalman::tuned(&[]));
+            let line = Demonstration::from_samples("line", &samples(speed)).unwrap();
+            let mut sender = Sender::new(method, &Kalman::tuned(&[line]));
             let sent: Vec<_> = samples(speed)
                 .iter()
                 .filter_map(|s| sender.take(s))

@@ -222,6 +222,8 @@ fn execute(args: &Args, name: &str, plan: &Plan) -> anyhow::Result<()> {
             row.id
         );
     }
+    rows.sort_by_key(|row| row.run);
+    rows.dedup_by_key(|row| row.run);
     // A course that is missing is a run that is.
     rows.retain(|row| !known[row.id.as_str()].shown || store.has_series(&row.id));
     let finished: std::collections::BTreeSet<String> =

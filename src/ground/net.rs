@@ -1,6 +1,6 @@
 //! An in-memory network: sockets that behave like UDP, links as in [`telemime_sim::link`].
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt;
 use std::io::{self, IoSliceMut};
 use std::net::SocketAddr;
@@ -29,6 +29,8 @@ struct State {
     links: BTreeMap<(SocketAddr, SocketAddr), Link>,
     down: bool,
     sockets: u64,
+    /// Sockets whose address is gone.
+    vanished: BTreeSet<u64>,
     under_way: usize,
     tape: Option<Vec<Taped>>,
     log: Option<Vec<Passage>>,
@@ -75,6 +77,7 @@ impl Network {
             links: BTreeMap::new(),
             down: false,
             sockets: 0,
+            vanished: BTreeSet::new(),
             under_way: 0,
             tape: None,
             log: None,
@@ -102,6 +105,17 @@ impl Network {
     /// Takes the socket at `addr` away: what it sends, and what is sent to it, is lost.
     pub fn remove(&self, addr: SocketAddr) {
         self.state().inboxes.remove(&addr);
+    }
+
+    /// Takes the address itself away, as when an interface goes: its socket fails from now on.
+    pub fn vanish(&self, addr: SocketAddr) {
+        let mut state = self.state();
+        if let Some(inbox) = state.inboxes.remove(&addr) {
+            state.vanished.insert(inbox.id);
+            if let Some(waker) = inbox.waker {
+                waker.wake();
+            }
+        }
     }
 
     /// Sets the link from `from` to `to`, which begins now: its outages and traces count from here.
@@ -266,6 +280,9 @@ impl AsyncUdpSocket for Socket {
             .segment_size
             .unwrap_or(transmit.contents.len())
             .max(1);
+        if self.network.state().vanished.contains(&self.id) {
+            return Err(io::ErrorKind::AddrNotAvailable.into());
+        }
         for packet in transmit.contents.chunks(segment) {
             self.network.send(self, transmit.destination, packet);
         }
@@ -279,6 +296,9 @@ impl AsyncUdpSocket for Socket {
         meta: &mut [RecvMeta],
     ) -> Poll<io::Result<usize>> {
         let mut state = self.network.state();
+        if state.vanished.contains(&self.id) {
+            return Poll::Ready(Err(io::ErrorKind::AddrNotAvailable.into()));
+        }
         let inbox = state.inboxes.get_mut(&self.addr);
         let Some(inbox) = inbox.filter(|inbox| inbox.id == self.id) else {
             // Taken away: nothing arrives any more, and nobody is told.

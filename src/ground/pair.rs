@@ -15,12 +15,13 @@ use telemime_endpoint::{
     External, Fingerprint, HostClock, Identity, IdentityError, Meter, Mono, Trust, quic,
 };
 use telemime_operator::daemon::{
-    Daemon as OperatorDaemon, DaemonError, Learning, Notice as OperatorNotice, Summary,
+    Daemon as OperatorDaemon, DaemonError, Learning, Notice as OperatorNotice, Reopen, Summary,
 };
 use telemime_operator::session::SessionConfig;
 use telemime_operator::task::Task;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
+use telemime_robot::blackbox::{Due, Header, Recorder, SPAN_S, taps};
 use telemime_robot::daemon::{Daemon as RobotDaemon, Notice as RobotNotice};
 use telemime_robot::desk::Desk;
 use telemime_robot::rig::Rig;
@@ -52,6 +53,9 @@ pub enum PairError {
 
 /// Not the robot's clock: the operators' session clock is an hour and a half off.
 const SESSION_ZERO: Mono = Mono(-5_400_000_000_000);
+
+/// Hosts from here on are where operators go whose address has vanished.
+const SPARE: u8 = 128;
 
 fn host(n: u8) -> SocketAddr {
     SocketAddr::new(IpAddr::V4(Ipv4Addr::new(192, 0, 2, n)), 4433)
@@ -108,11 +112,15 @@ pub struct Pair {
     pub learning: Learning,
 }
 
+/// What it was written for, and a black box.
+type Record = (Due, Vec<u8>);
+
 /// The robot of a [`Pair`]: what it reports, tick by tick.
 #[derive(Clone)]
 pub struct Robot {
     reports: Rc<RefCell<Vec<Report>>>,
     notices: Rc<RefCell<Vec<RobotNotice>>>,
+    records: Rc<RefCell<Vec<Record>>>,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
     endpoint: quinn::Endpoint,
@@ -127,6 +135,8 @@ pub struct Operator {
     pub notices: mpsc::UnboundedReceiver<OperatorNotice>,
     /// Its address.
     pub addr: SocketAddr,
+    /// Where it binds should that one vanish.
+    pub spare: SocketAddr,
     endpoint: quinn::Endpoint,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
@@ -136,20 +146,39 @@ impl Robot {
     fn start(
         network: &Network,
         clock: HostClock,
-        rig: &Rig,
+        (rig, recorded): (&Rig, bool),
         identity: &Identity,
         trust: &Trust,
         config: RobotConfig,
         (external, watcher): (Option<External>, Option<Watcher>),
     ) -> Result<Self, PairError> {
-        let (mut core, handle) = Watched::new(|rings| rig.servo(rings), clock, watcher);
-        let period = Duration::from_secs_f64(core.tick_s());
+        let mut recorder = None;
+        let make = |rings| {
+            let station = rig.servo(rings);
+            if !recorded {
+                return station;
+            }
+            let (tap, feed) = taps(&station.room());
+            recorder = Some(Recorder::new(Header::new(rig, None), feed, SPAN_S));
+            station.recorded(tap)
+        };
+        let (mut station, handle) = Watched::new(make, clock, watcher);
+        let records: Rc<RefCell<Vec<_>>> = Rc::default();
+        let kept = records.clone();
+        let period = Duration::from_secs_f64(station.tick_s());
         let servo = tokio::task::spawn_local(async move {
             let mut tick = interval(period);
             tick.set_missed_tick_behavior(MissedTickBehavior::Burst);
             loop {
                 tick.tick().await;
-                core.tick();
+                let report = station.tick();
+                // As often as the thread does it that a robot has for this.
+                if let Some(recorder) = recorder.as_mut().filter(|_| report.tick % 50 == 0)
+                    && let Some(due) = recorder.drain()
+                    && let Some(bytes) = recorder.bytes(due)
+                {
+                    kept.borrow_mut().push((due, bytes));
+                }
             }
         });
         let socket = quic::Socket::Abstract {
@@ -172,6 +201,7 @@ impl Robot {
         let robot = Self {
             reports: Rc::default(),
             notices: Rc::default(),
+            records,
             quit,
             words,
             endpoint: connections,
@@ -198,6 +228,11 @@ impl Robot {
     /// Every tick so far.
     pub fn reports(&self) -> std::cell::Ref<'_, Vec<Report>> {
         self.reports.borrow()
+    }
+
+    /// What its black box has written so far, if the pair was [started with one](Pair::start_recorded).
+    pub fn records(&self) -> std::cell::Ref<'_, Vec<Record>> {
+        self.records.borrow()
     }
 
     /// Everything else it noticed so far.
@@ -278,7 +313,15 @@ impl Pair {
     /// # Errors
     /// [`PairError`].
     pub fn start_with(rig: &Rig, config: RobotConfig) -> Result<Self, PairError> {
-        Self::start_as(rig, config, None, None)
+        Self::start_as((rig, false), config, None, None)
+    }
+
+    /// As [`Pair::start`], with a black box at the robot.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn start_recorded(rig: &Rig) -> Result<Self, PairError> {
+        Self::start_as((rig, true), Default::default(), None, None)
     }
 
     /// As [`Pair::start`], with disciplined clocks at the robot and at the operators.
@@ -290,7 +333,12 @@ impl Pair {
         robot: External,
         operators: External,
     ) -> Result<Self, PairError> {
-        Self::start_as(rig, Default::default(), Some((robot, operators)), None)
+        Self::start_as(
+            (rig, false),
+            Default::default(),
+            Some((robot, operators)),
+            None,
+        )
     }
 
     /// As [`Pair::start`], under the eyes of `watcher`; with disciplined clocks, the robot's and the operators', if there
@@ -303,11 +351,11 @@ impl Pair {
         watcher: Watcher,
         external: Option<(External, External)>,
     ) -> Result<Self, PairError> {
-        Self::start_as(rig, Default::default(), external, Some(watcher))
+        Self::start_as((rig, false), Default::default(), external, Some(watcher))
     }
 
     fn start_as(
-        rig: &Rig,
+        rig: (&Rig, bool),
         config: RobotConfig,
         external: Option<(External, External)>,
         watcher: Option<Watcher>,
@@ -354,7 +402,7 @@ impl Pair {
         self.robot = Robot::start(
             network,
             clock,
-            rig,
+            (rig, false),
             identity,
             &self.trust,
             self.config,
@@ -456,8 +504,21 @@ impl Pair {
     ) -> Result<Operator, PairError> {
         let (endpoint, meter) = self.client(identity, &trust, link, seed)?;
         let (endpoint_copy, addr) = (endpoint.clone(), host(1 + self.operators));
+        let spare = host(SPARE + self.operators);
+        let reopen = {
+            let (network, trust, meter) = (self.network.clone(), trust.clone(), meter.clone());
+            let identity = Identity::from_pem(&identity.to_pem())?;
+            Reopen::new(move || {
+                let socket = quic::Socket::Abstract {
+                    socket: network.socket(spare),
+                    seed: [SPARE; 32],
+                };
+                quic::client(&identity, &trust, socket, &meter)
+            })
+        };
         let daemon = OperatorDaemon {
             endpoint,
+            reopen: Some(reopen),
             trust,
             meter,
             robot: host(1),
@@ -481,6 +542,7 @@ impl Pair {
             done,
             notices,
             addr,
+            spare,
             endpoint: endpoint_copy,
             quit,
             words,

@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::rc::Rc;
 
 use telemime_endpoint::{HostClock, Mono};
-use telemime_robot::servo::{self, Core, Handle, Lease, Order, Report, Rings, Source, Ticket};
+use telemime_robot::servo::{self, Handle, Lease, Order, Report, Rings, Source, Station, Ticket};
 
 /// An order as the servo is given it, without what it weighs.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -50,7 +50,7 @@ pub type Watcher = Rc<RefCell<dyn FnMut(&[Told], &Report)>>;
 
 /// A servo whose orders pass by a [`Watcher`]; without one they go straight to it.
 pub(super) struct Watched {
-    core: Core,
+    core: Station,
     clock: HostClock,
     tap: Option<Tap>,
 }
@@ -65,7 +65,7 @@ struct Tap {
 impl Watched {
     /// The servo that `make` makes of its ends of the rings, and the session's ends.
     pub(super) fn new(
-        make: impl FnOnce(Rings) -> Core,
+        make: impl FnOnce(Rings) -> Station,
         clock: HostClock,
         watcher: Option<Watcher>,
     ) -> (Self, Handle) {
@@ -95,11 +95,10 @@ impl Watched {
     }
 
     /// One tick, now.
-    pub(super) fn tick(&mut self) {
+    pub(super) fn tick(&mut self) -> Report {
         let now = self.clock.now();
         let Some(tap) = &mut self.tap else {
-            self.core.tick(now);
-            return;
+            return self.core.tick(now);
         };
         tap.told.clear();
         while let Ok(order) = tap.orders.pop() {
@@ -109,5 +108,6 @@ impl Watched {
         }
         let report = self.core.tick(now);
         (tap.watcher.borrow_mut())(&tap.told, &report);
+        report
     }
 }

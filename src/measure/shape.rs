@@ -202,7 +202,8 @@ mod tests {
     fn a_late_tip_is_on_the_path_and_a_tip_beside_it_is_off_by_the_distance() {
         let truth = sine(1.0, 0);
         let late = off_path(&sine(1.0, 100), &truth, 500, 5);
-        assert!(late.iter().all(|d| *d < 1e-6));
+        // Before the recording there is no path to be on.
+        assert!(late[20..].iter().all(|d| *d < 1e-6));
         let beside: Vec<_> = truth.iter().map(|x| x + Vector3::z() * 0.02).collect();
         let off = off_path(&beside, &truth, 500, 5);
         assert!(off.iter().all(|d| (d - 0.02).abs() < 1e-9));

@@ -26,7 +26,7 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::v1;
 use telemime_robot::rig::{Rig, RigOptions};
-use telemime_robot::servo::{self, Core, Order};
+use telemime_robot::servo::{self, Order, Station};
 use telemime_robot::session as robot;
 
 /// Length of the bare messages, B; about that of a motion.
@@ -105,10 +105,13 @@ fn bare_udp() -> Round {
     }
 }
 
+/// Takes a message; says whether it is to be answered.
+type Take = Box<dyn FnMut(&[u8]) -> bool + Send>;
+
 /// What the two ends of a QUIC echo do with a message: what is sent, and whether what has arrived is to be answered.
 struct Ends {
     send: Box<dyn FnMut() -> Vec<u8> + Send>,
-    take: Box<dyn FnMut(&[u8]) -> bool + Send>,
+    take: Take,
 }
 
 fn keys() -> [(Identity, Trust); 2] {
@@ -201,7 +204,7 @@ fn bare() -> Ends {
 struct Engaged {
     operator: operator::Session,
     robot: robot::Session,
-    core: Core,
+    station: Station,
     handle: servo::Handle,
     clock: HostClock,
 }
@@ -230,11 +233,12 @@ impl Engaged {
         let mut engaged = Self {
             operator: operator::Session::new(config, None, EPOCH),
             robot: robot::Session::new(Default::default(), rig.info(), EPOCH, None, now),
-            core: rig.servo(rings),
+            station: rig.servo(rings),
             handle,
             clock,
         };
         for i in 0..5000 {
+            #[expect(clippy::disallowed_methods, reason = "a bench runs in real time")]
             thread::sleep(Duration::from_millis(1));
             let now = clock.now();
             let sample = HandSample::at(Stamp(now.0), Vector3::new(0.0, 0.0, 2.0));
@@ -277,7 +281,7 @@ impl Engaged {
                 robot::Output::Brake(_) | robot::Output::Goodbye => {}
             }
         }
-        let report = self.core.tick(now);
+        let report = self.station.tick(now);
         self.robot.handle_report(&report, Default::default());
     }
 

@@ -28,6 +28,7 @@ class Operator(QuicConnectionProtocol):
         super().__init__(*args, **kwargs)
         self.stream, self.buffer, self.epoch = None, b"", None
         self.control, self.telemetry, self.pings, self.closed = asyncio.Queue(), [], 0, None
+        self.reception = None
         self.fresh = asyncio.Event()
 
     @staticmethod
@@ -74,6 +75,8 @@ class Operator(QuicConnectionProtocol):
             now = self.clock_us()
             self.pings += 1
             self.datagram({"Pong": {"epoch": self.epoch, "t1_us": fields["t1_us"], "t2_us": now, "t3_us": now}})
+        elif name == "Reception":
+            self.reception = fields
         else:
             self.telemetry.append(fields)
             self.fresh.set()

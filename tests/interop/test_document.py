@@ -46,7 +46,7 @@ class Document(unittest.TestCase):
             "operator control": "engage-mirror engage-play path reset",
             "robot control": "info engaged refused state",
             "operator datagram": "motion motion-pose go go-bend pong stop clock",
-            "robot datagram": "ping telemetry",
+            "robot datagram": "ping telemetry reception",
         }
         for kind, names in kinds.items():
             for name in names.split():
@@ -64,6 +64,9 @@ class Document(unittest.TestCase):
         t = messages.read("robot datagram", document.example("telemetry"))["Telemetry"]
         self.assertEqual((t["seq"], t["state"], t["t_us"], t["age_ms"], t["grip"]), (300, "Engaged", 3_100_000, 180, 255))
         self.assertEqual(t["q"], [0.0, 1.0])
+        r = messages.read("robot datagram", document.example("reception"))["Reception"]
+        self.assertEqual((r["newest_seq"], r["received"], r["longest_loss_run"]), (42, 40, 2))
+        self.assertEqual((r["delay_us"][2], r["age_us"][3]), (109_000, 310_000))
         stream = document.example("frame")
         self.assertEqual(frames.parse(stream), (b"\x05", False, 5))
         self.assertEqual(messages.read("operator control", b"\x05"), "EmergencyStop")

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 21] = [
+const COMMANDS: [&str; 22] = [
     "demo",
     "import",
     "learn",
@@ -16,6 +16,7 @@ const COMMANDS: [&str; 21] = [
     "evaluate",
     "codec",
     "robot",
+    "replay",
     "arm check",
     "operator",
     "identity",

@@ -4,12 +4,15 @@
     reason = "clippy.toml allows it in tests, but does not know these helpers for tests"
 )]
 
+mod adapting;
 mod alignment;
 mod arms;
+mod blackbox;
 mod codec;
 mod commands;
 mod correct;
 mod data;
+mod driver;
 mod evaluate;
 mod floods;
 mod frames;

@@ -26,8 +26,8 @@ use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::{
     self, Cause, Drive, Engage, ExternalClock, Info, Message, Motion, OperatorControl,
-    OperatorDatagram, PathTail, Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
-    WireParams, model_tag,
+    OperatorDatagram, PathTail, Reception, Refusal, RobotControl, RobotDatagram, RobotState,
+    Telemetry, WireParams, model_tag,
 };
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo;
@@ -445,6 +445,21 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
             }),
         ),
         ("telemetry", message(&RobotDatagram::Telemetry(telemetry()))),
+        (
+            "reception",
+            message(&RobotDatagram::Reception(Reception {
+                epoch: 7,
+                newest_seq: 42,
+                received: 40,
+                duplicates: 0,
+                reordered: 1,
+                loss_runs: 1,
+                longest_loss_run: 2,
+                jitter_us: 3_300,
+                delay_us: [101_000, 100_500, 109_000, 110_000],
+                age_us: [150_000, 145_000, 240_000, 310_000],
+            })),
+        ),
         ("plan", codec::encode(&plan())),
         ("pair-offer", pairing(PairMessage::Offer(name("laptop")))),
         (

@@ -182,7 +182,6 @@ fn a_link_that_is_dead_one_way_only_is_back_as_soon() {
 }
 
 #[test]
-#[ignore = "open: after an outage the attempts themselves queue on 64 kbit/s"]
 fn a_thin_link_is_not_drowned_by_attempts() {
     run_virtual(async {
         let thin = LinkConfig {

@@ -587,7 +587,8 @@ impl Shift {
                     .collect();
                 datagram[0] %= 6;
                 connection.send_datagram(datagram.into()).ok()?;
-                tokio::time::sleep(Duration::from_millis(5)).await;
+                tokio::time::sleep_until(tokio::time::Instant::now() + Duration::from_millis(5))
+                    .await;
             }
             let nonsense: Vec<u8> = (0..300).map(|_| rng.random()).collect();
             control.write(&nonsense).await.ok()?;

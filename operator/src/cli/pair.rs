@@ -17,7 +17,8 @@ use tokio::time::timeout;
 /// Pair with a robot that has a pairing window open.
 ///
 /// Both ends show a code of eight digits, made of both keys and this very connection; somebody in between would
-/// make them differ. Compare them, and say yes at both ends; only then is anything stored. The window is opened at
+/// make them differ. Compare them, and say yes at both ends, or type here the code that the robot shows, as a script
+/// would that reads both ends' --json; only then is anything stored. The window is opened at
 /// the robot, by `pair` on its terminal or --pair at its start, and is for one attempt.
 #[derive(clap::Args, Debug, Clone)]
 pub struct PairArgs {
@@ -42,7 +43,7 @@ pub struct PairArgs {
     /// Give up if the robot does not answer within this time, s.
     #[arg(long, value_name = "S", default_value_t = 5.0)]
     pub patience: f64,
-    /// Print events as JSON lines on stdout; yes or no is read from stdin all the same.
+    /// Print events as JSON lines on stdout; yes, no or the robot's code is read from stdin all the same.
     #[arg(long)]
     pub json: bool,
 }
@@ -163,23 +164,36 @@ async fn decide(
     if !asked {
         return Ok(());
     }
-    pairing::word(seen && user_says_yes().await)
+    pairing::word(seen && user_says_yes(shown.code.to_string()).await)
 }
 
-/// The next yes or no on stdin; its end is a no.
-fn user_says_yes() -> impl Future<Output = bool> {
+/// What a line of the user's says to `code`: yes, no, or nothing that is understood.
+fn answer(line: &str, code: &str) -> Option<bool> {
+    let digits = |text: &str| -> String { text.split_whitespace().collect() };
+    match line.trim() {
+        "yes" => Some(true),
+        "no" => Some(false),
+        other if !other.is_empty() && digits(other).bytes().all(|b| b.is_ascii_digit()) => {
+            Some(digits(other) == digits(code))
+        }
+        _ => None,
+    }
+}
+
+/// The next answer on stdin; its end is a no.
+fn user_says_yes(code: String) -> impl Future<Output = bool> {
     let (word_tx, word) = oneshot::channel();
     // A thread of its own, never joined: a blocking read cannot be cancelled, and ends with the process.
     let asking = std::thread::Builder::new().spawn(move || {
         let words = std::io::stdin().lock().lines().map_while(Result::ok);
         for line in words {
-            match line.trim() {
-                "yes" => {
+            match answer(&line, &code) {
+                Some(true) => {
                     let _ = word_tx.send(true);
                     return;
                 }
-                "no" => break,
-                _ => eprintln!("yes or no?"),
+                Some(false) => break,
+                None => eprintln!("yes, no, or the code the robot shows?"),
             }
         }
         let _ = word_tx.send(false);
@@ -208,4 +222,23 @@ fn show(
     let mut out = std::io::stdout().lock();
     writeln!(out, "{line}").and_then(|()| out.flush())?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_robots_code_is_a_yes_and_any_other_a_no() {
+        let says = |line| answer(line, "0204 2024");
+        for yes in [" yes ", "0204 2024", "02042024"] {
+            assert_eq!(says(yes), Some(true), "{yes}");
+        }
+        for no in ["no", "0204 2025", "2042024", "0"] {
+            assert_eq!(says(no), Some(false), "{no}");
+        }
+        for neither in ["", "  ", "y", "0204-2024", "yes 0204 2024"] {
+            assert_eq!(says(neither), None, "{neither}");
+        }
+    }
 }

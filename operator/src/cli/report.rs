@@ -253,6 +253,7 @@ pub enum Event {
         packets_on_wire: u64,
         bytes_session_up: u64,
         bytes_session_down: u64,
+        link: session::Seen,
     },
 }
 
@@ -281,6 +282,7 @@ impl Event {
             packets_on_wire: motion.packets,
             bytes_session_up: sent.bytes - motion.bytes,
             bytes_session_down: received.bytes,
+            link: summary.seen,
         }
     }
 
@@ -422,10 +424,11 @@ impl Event {
                 bytes_on_wire,
                 bytes_session_up,
                 bytes_session_down,
+                link,
                 ..
             } => format!(
                 "{samples} samples in {messages} messages with {knots} path knots: {bytes_on_wire} B on the wire \
-                 (and {bytes_session_up} B up, {bytes_session_down} B down for the session){}",
+                 (and {bytes_session_up} B up, {bytes_session_down} B down for the session){}\n{link}",
                 if *glitches > 0 {
                     format!("; {glitches} glitches replaced")
                 } else {

@@ -43,6 +43,7 @@ impl Session {
     /// What a hand does to a plan cannot wait for the shortest interval.
     fn tell_of(&mut self, change: Change, now: Stamp) {
         self.events.push_back(Event::Correction(change));
+        self.news = true;
         self.speak(now);
     }
 

@@ -107,6 +107,12 @@ impl Session {
                 }
             }
             Ok(RobotDatagram::Telemetry(telemetry)) if telemetry.epoch == self.epoch => {
+                let said =
+                    (telemetry.t_us != 0).then(|| Stamp(telemetry.t_us.saturating_mul(1000)));
+                self.down
+                    .arrive(telemetry.seq, said.map(|at| now.secs_since(at)));
+                self.pace.on_telemetry(now, &telemetry);
+                self.clock_uncertainty_us = Some(telemetry.clock_uncertainty_us);
                 if let Activity::Mirror(mirror) = &mut self.activity
                     && telemetry.engagement == self.engagement
                 {
@@ -121,6 +127,13 @@ impl Session {
                     };
                 }
                 self.events.push_back(Event::Telemetry(Box::new(telemetry)));
+            }
+            Ok(RobotDatagram::Reception(told)) if told.epoch == self.epoch => {
+                // Reordered ones are no news.
+                if self.up.is_none_or(|up| up.newest_seq <= told.newest_seq) {
+                    self.pace.on_reception(&told);
+                    self.up = Some(told);
+                }
             }
             _ => self.counters.dropped += 1,
         }

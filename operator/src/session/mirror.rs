@@ -38,10 +38,7 @@ const TURN_SIGMAS: f64 = 0.6;
 /// A gripper is told of changes above this, in steps of 1/255.
 const GRIP_STEPS: u8 = 4;
 
-/// Every knot travels in this many messages at once, so that a lost packet costs no round trip …
-const COPIES: u8 = 2;
-
-/// … and again when it is still not acknowledged after the round trip and this long, s.
+/// A knot that is still not acknowledged after the round trip and this long goes again, s.
 const PATIENCE_S: f64 = 0.15;
 
 /// What is kept of an engagement, in samples: half an hour of a tracker of 60 Hz. What comes later is not.
@@ -122,7 +119,8 @@ impl Mirror {
             first_unacknowledged: 0,
             places,
             turns,
-            without_model: false,
+            // The robot ends with the model it began with, so a model that arrives now is for the next engagement.
+            without_model: skill.is_none(),
             newest: None,
             sent: None,
             messages: 0,
@@ -310,12 +308,13 @@ impl Mirror {
         turned || gripped
     }
 
-    /// The next message but for its envelope; `None` if the hand is nowhere that can be sent.
+    /// The next message but for its envelope, said `now` over a link of this delay, s, its knots in so many copies;
+    /// `None` if the hand is nowhere that can be sent.
     pub(super) fn motion(
         &mut self,
         skill: Option<&Skill>,
-        now: Stamp,
-        delay_s: f64,
+        (now, delay_s): (Stamp, f64),
+        copies: u8,
     ) -> Option<Motion> {
         let skill = skill.filter(|_| !self.without_model);
         let travelling = self.travelling()?;
@@ -327,7 +326,7 @@ impl Mirror {
             params,
             pose,
         } = travelling;
-        let (first_knot, knots) = self.due_knots(&state, now, delay_s);
+        let (first_knot, knots) = self.due_knots(&state, (now, delay_s), copies);
         Some(Motion {
             epoch: 0,
             engagement: 0,
@@ -345,12 +344,17 @@ impl Mirror {
     }
 
     /// The knots for a message sent now, without a gap, and the number of the first.
-    fn due_knots(&mut self, state: &WireState, now: Stamp, delay_s: f64) -> (u32, KnotBlock) {
+    fn due_knots(
+        &mut self,
+        state: &WireState,
+        (now, delay_s): (Stamp, f64),
+        copies: u8,
+    ) -> (u32, KnotBlock) {
         let overdue = |u: &Unacknowledged| now.secs_since(u.sent) > 2.0 * delay_s + PATIENCE_S;
         let start = self
             .unacknowledged
             .iter()
-            .position(|u| u.copies < COPIES || overdue(u));
+            .position(|u| u.copies < copies || overdue(u));
         let start = start.unwrap_or(self.unacknowledged.len());
         let end = self.unacknowledged.len().min(start + KNOTS_PER_MESSAGE);
         let packed = self.packed(state, start, end);

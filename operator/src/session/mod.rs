@@ -11,6 +11,7 @@ mod gate;
 mod hand;
 mod hear;
 mod mirror;
+mod pace;
 mod said;
 #[cfg(test)]
 mod tests;
@@ -18,6 +19,7 @@ mod tests;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
+use telemime_endpoint::reception::Reception;
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::predict::Params;
 use telemime_protocol::skill::Skill;
@@ -26,19 +28,20 @@ use telemime_protocol::wire::Version;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::v1::{
     Drive, Engage, ExternalClock, Info, Message, OperatorControl, OperatorDatagram, PathTail,
-    Refusal, RobotState,
+    Reception as Told, Refusal, RobotState,
 };
 
 use crate::recognise::{Recogniser, Verdict};
 
 pub use config::{FutureBound, HandSample, SessionConfig, default_scale};
 pub use correct::{Bent, Change, LOST_S, Leeway};
-pub use said::{Counters, Event, Output};
+pub use said::{Counters, Event, Output, Seen};
 
 use correct::Correction;
 use gate::{Gate, Taken};
 use hand::{Hand, Interval};
 use mirror::Mirror;
+use pace::{Pace, REPEAT_S};
 
 /// While an emergency stop is not confirmed, it is repeated at this interval, s.
 const STOP_REPEAT_S: f64 = 0.01;
@@ -83,6 +86,16 @@ pub struct Session {
     seq: u32,
     plans: u32,
     delay_s: f64,
+    pace: Pace,
+    /// How far the next message has to be from the last one.
+    interval_s: f64,
+    /// What is being said is new.
+    news: bool,
+    /// When to say it again, if that is worth it.
+    repeat: Option<Stamp>,
+    down: Reception,
+    up: Option<Told>,
+    clock_uncertainty_us: Option<u32>,
     last_sent: Stamp,
     /// There was something to say before the shortest interval was over.
     urgent: bool,
@@ -119,6 +132,13 @@ impl Session {
             seq: 0,
             plans: 0,
             delay_s: 0.0,
+            pace: Pace::new(config.min_interval_s, config.max_silence_s),
+            interval_s: config.min_interval_s,
+            news: false,
+            repeat: None,
+            down: Reception::default(),
+            up: None,
+            clock_uncertainty_us: None,
             last_sent: Stamp::ZERO,
             urgent: false,
             next_stop: None,
@@ -172,6 +192,11 @@ impl Session {
     /// The counters.
     pub fn counters(&self) -> Counters {
         self.counters
+    }
+
+    /// What has become of the session's datagrams on their way.
+    pub fn seen(&self) -> Seen {
+        Seen::new(self.up.as_ref(), &self.down, self.clock_uncertainty_us)
     }
 
     /// Tip metres per hand metre of the next engagement; `None` before the robot has introduced itself.
@@ -248,10 +273,11 @@ impl Session {
         let backlog = mirror.backlog();
         let arrival = now.offset_by_secs(network_s + lag_s);
         let silent_s = now.secs_since(self.last_sent);
-        if mirror.future_changed(arrival, self.config.future_bound)
-            || silent_s >= self.config.max_silence_s
-        {
+        let bound = self.pace.widen(self.config.future_bound);
+        if mirror.future_changed(arrival, bound) {
             self.speak_soon(now);
+        } else if silent_s >= self.config.max_silence_s {
+            self.speak(now);
         }
         if let Some(tail) = backlog {
             self.path(tail);
@@ -271,7 +297,8 @@ impl Session {
 
     /// Within the shortest interval the news waits, and what is then said is the newest.
     fn speak_soon(&mut self, now: Stamp) {
-        self.urgent = now.secs_since(self.last_sent) < self.config.min_interval_s;
+        self.news = true;
+        self.urgent = now.secs_since(self.last_sent) < self.interval_s;
         if !self.urgent {
             self.speak(now);
         }
@@ -409,7 +436,9 @@ impl Session {
             self.next_stop = Some(now.offset_by_secs(STOP_REPEAT_S));
             self.datagram(&OperatorDatagram::Stop { epoch: self.epoch });
         }
-        if self.next_word().is_some_and(|due| now >= due) {
+        if self.next_word().is_some_and(|due| now >= due)
+            || self.repeat.is_some_and(|due| now >= due)
+        {
             self.speak(now);
         }
         if self.next_look().is_some_and(|due| now >= due) {
@@ -436,7 +465,11 @@ impl Session {
         let look = self
             .next_look()
             .map(|due| (due, "see what the hand makes of the plan"));
-        [stop, word, look].into_iter().flatten().min_by_key(|w| w.0)
+        let repeat = self.repeat.map(|due| (due, "say again what may be lost"));
+        [stop, word, look, repeat]
+            .into_iter()
+            .flatten()
+            .min_by_key(|w| w.0)
     }
 
     fn next_look(&self) -> Option<Stamp> {
@@ -476,6 +509,7 @@ impl Session {
 
     /// Nothing is driven any more.
     fn end_activity(&mut self) {
+        self.repeat = None;
         if let Activity::Mirror(mirror) = std::mem::replace(&mut self.activity, Activity::Nothing)
             && self.before.is_none()
         {
@@ -488,15 +522,15 @@ impl Session {
         match self.activity {
             Activity::Nothing | Activity::Play { engaged: false, .. } => None,
             Activity::Mirror(_) => Some(self.last_sent.offset_by_secs(if self.urgent {
-                self.config.min_interval_s
+                self.interval_s
             } else {
                 self.config.max_silence_s
             })),
             Activity::Play { engaged: true, .. } => Some(self.last_sent.offset_by_secs(
                 self.config.max_silence_s.min(if self.urgent {
-                    self.config.min_interval_s
+                    self.interval_s
                 } else {
-                    GO_S
+                    self.interval_s.max(GO_S)
                 }),
             )),
         }
@@ -506,6 +540,9 @@ impl Session {
     fn speak(&mut self, now: Stamp) {
         self.last_sent = now;
         self.urgent = false;
+        self.interval_s = self.pace.interval_s(now);
+        let again = std::mem::take(&mut self.news) && self.pace.repeats();
+        self.repeat = again.then(|| now.offset_by_secs(REPEAT_S));
         self.seq += 1;
         let lease_ms = (self.config.lease_s * 1e3) as u16;
         let network_s = self.network_delay_s();
@@ -528,7 +565,8 @@ impl Session {
             }
             Activity::Mirror(mirror) => {
                 let skill = self.skill.as_deref().filter(|_| self.model_stored);
-                let Some(mut motion) = mirror.motion(skill, now, network_s) else {
+                let Some(mut motion) = mirror.motion(skill, (now, network_s), self.pace.copies())
+                else {
                     return;
                 };
                 motion.epoch = self.epoch;

@@ -2,8 +2,12 @@
 
 use super::correct::{Bent, Change};
 use crate::recognise::Verdict;
+use std::fmt;
+
 use nalgebra::UnitQuaternion;
-use telemime_protocol::wire::v1::{Cause, Refusal, RobotState, Telemetry};
+use serde::{Deserialize, Serialize};
+use telemime_endpoint::reception::{Quantiles, Received, Reception};
+use telemime_protocol::wire::v1::{Cause, Reception as Told, Refusal, RobotState, Telemetry};
 
 /// What a session wants sent.
 #[derive(Debug, Clone, PartialEq)]
@@ -88,5 +92,65 @@ impl Counters {
         self.knots += other.knots;
         self.glitches += other.glitches;
         self.dropped += other.dropped;
+    }
+}
+
+/// What has become of a session's datagrams, each way.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Seen {
+    /// Our motions and goes, as the robot said last; `None` if it has not.
+    pub up: Option<Received>,
+    /// How old the hand state was that the robot followed, over its servo ticks.
+    pub age: Option<Quantiles>,
+    /// The robot's telemetry.
+    pub down: Received,
+    /// How wrong the robot's estimate of the session clock may be, s: so may the delays, in opposite directions.
+    pub clock_bound_s: Option<f64>,
+}
+
+impl Seen {
+    pub(super) fn new(up: Option<&Told>, down: &Reception, clock_us: Option<u32>) -> Self {
+        let times = |us: [u32; 4]| {
+            let [mean_s, p50_s, p95_s, max_s] = us.map(|us| f64::from(us) * 1e-6);
+            (max_s > 0.0).then_some(Quantiles {
+                mean_s,
+                p50_s,
+                p95_s,
+                max_s,
+            })
+        };
+        Self {
+            up: up.map(|told| Received {
+                received: told.received,
+                lost: told.newest_seq.saturating_sub(told.received),
+                duplicates: told.duplicates,
+                reordered: told.reordered,
+                loss_runs: told.loss_runs,
+                longest_loss_run: told.longest_loss_run,
+                jitter_s: f64::from(told.jitter_us) * 1e-6,
+                delay: times(told.delay_us),
+            }),
+            age: up.and_then(|told| times(told.age_us)),
+            down: down.summary(),
+            clock_bound_s: clock_us
+                .filter(|us| *us != u32::MAX)
+                .map(|us| f64::from(us) * 1e-6),
+        }
+    }
+}
+
+impl fmt::Display for Seen {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(up) = &self.up {
+            writeln!(f, "to the robot: {up}")?;
+        }
+        write!(f, "from the robot: {}", self.down)?;
+        if let Some(age) = &self.age {
+            write!(f, "\nwhat the arm followed was {age} old")?;
+        }
+        if let Some(bound_s) = self.clock_bound_s {
+            write!(f, "; clock known to ±{:.2} ms", bound_s * 1e3)?;
+        }
+        Ok(())
     }
 }

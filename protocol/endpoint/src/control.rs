@@ -8,7 +8,9 @@ use telemime_protocol::wire::frame::{self, Deframer, Frame};
 use telemime_protocol::wire::hello::{self, Answer, Hello, HelloError};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
-use tokio::time::timeout;
+use tokio::time::{Instant, timeout};
+
+use crate::quic;
 
 /// A peer that connects but does not greet within this time is let go.
 pub const GREETING_TIMEOUT: Duration = Duration::from_secs(5);
@@ -20,7 +22,7 @@ const READ_AHEAD: usize = 4;
 #[derive(Debug, thiserror::Error)]
 pub enum ControlError {
     /// The connection ended.
-    #[error("{}", crate::quic::explain(.0))]
+    #[error("{}", quic::explain(.0))]
     Connection(#[from] quinn::ConnectionError),
     /// The stream was reset or closed under us.
     #[error("control stream: {0}")]
@@ -44,6 +46,7 @@ pub enum ControlError {
 pub struct Control {
     /// Towards the peer.
     pub send: SendStream,
+    connection: Connection,
     recv: RecvStream,
     read: Vec<u8>,
 }
@@ -57,6 +60,7 @@ impl Control {
         let (send, recv) = connection.open_bi().await?;
         Ok(Self {
             send,
+            connection: connection.clone(),
             recv,
             read: Vec::new(),
         })
@@ -72,6 +76,7 @@ impl Control {
             .map_err(|_| ControlError::Silent)??;
         Ok(Self {
             send,
+            connection: connection.clone(),
             recv,
             read: Vec::new(),
         })
@@ -108,7 +113,7 @@ impl Control {
     pub fn into_frames(self) -> (Writer, mpsc::Receiver<Result<Frame, ControlError>>) {
         let (tx, rx) = mpsc::channel(READ_AHEAD);
         tokio::spawn(read_frames(self.recv, self.read, tx));
-        (Writer::start(self.send), rx)
+        (Writer::start(self.connection, self.send), rx)
     }
 
     async fn greeting<T>(
@@ -150,10 +155,10 @@ pub struct Writer {
 }
 
 impl Writer {
-    /// Starts writing to `send`.
-    pub fn start(send: SendStream) -> Self {
+    /// Starts writing to `send`, a stream of `connection`.
+    pub fn start(connection: Connection, send: SendStream) -> Self {
         let (queue, due) = mpsc::channel(MAX_UNREAD);
-        let written = tokio::spawn(write(send, due));
+        let written = tokio::spawn(write(connection, send, due));
         Self { queue, written }
     }
 
@@ -180,14 +185,68 @@ impl Writer {
     }
 }
 
-async fn write(mut send: SendStream, mut due: mpsc::Receiver<Vec<u8>>) {
+async fn write(connection: Connection, mut send: SendStream, mut due: mpsc::Receiver<Vec<u8>>) {
     while let Some(bytes) = due.recv().await {
-        if send.write_all(&bytes).await.is_err() {
+        let written = if bytes.len() > LONG {
+            write_long(&connection, &mut send, &bytes).await
+        } else {
+            send.write_all(&bytes).await
+        };
+        if written.is_err() {
             return;
         }
     }
     let _ = send.finish();
     let _ = send.stopped().await;
+}
+
+/// A message longer than this is a model or a plan.
+const LONG: usize = 4 * 1024;
+
+/// It is handed over in pieces of this length …
+const PIECE: usize = 1024;
+
+/// … so that no more of it is under way than the link carries in this time: what is behind it in the queue, the answers to the robot's
+/// clock and a stop, must not wait longer, and QUIC must not take the queue for loss and send it all again.
+const UNDER_WAY: Duration = Duration::from_millis(600);
+
+/// On a link whose handshake was answered within this, the first pieces take no time.
+const BRISK: Duration = Duration::from_millis(300);
+
+/// The least under way: three packets.
+const LEAST_WINDOW: u64 = 4 * 1024;
+
+/// Writes what may be long on a thin link. How fast QUIC takes it, once the window is full, is how fast the link carries it.
+async fn write_long(
+    connection: &Connection,
+    send: &mut SendStream,
+    bytes: &[u8],
+) -> Result<(), quinn::WriteError> {
+    let mut window = if connection.rtt() < BRISK {
+        quic::SEND_WINDOW
+    } else {
+        LEAST_WINDOW
+    };
+    connection.set_send_window(window);
+    let (mut taken, mut full_since) = (0, None::<Instant>);
+    for piece in bytes.chunks(PIECE) {
+        send.write_all(piece).await?;
+        taken += piece.len() as u64;
+        if taken < window {
+            continue;
+        }
+        let now = Instant::now();
+        // The first round only filled the window.
+        if let Some(since) = full_since {
+            let took_s = (now - since).as_secs_f64().max(1e-3);
+            let carried = taken as f64 / took_s * UNDER_WAY.as_secs_f64();
+            window = (carried as u64).clamp(LEAST_WINDOW, quic::SEND_WINDOW);
+            connection.set_send_window(window);
+        }
+        (taken, full_since) = (0, Some(now));
+    }
+    connection.set_send_window(quic::SEND_WINDOW);
+    Ok(())
 }
 
 async fn read_frames(

@@ -7,13 +7,16 @@ pub mod clock;
 pub mod control;
 pub mod identity;
 pub mod meter;
+pub mod pacer;
 pub mod pairing;
 pub mod peers;
 pub mod quic;
+pub mod reception;
 pub mod tls;
 pub mod trust;
 
 pub use clock::{External, HostClock, Mono};
 pub use identity::{Fingerprint, Identity, IdentityError};
 pub use meter::Meter;
+pub use pacer::Pacer;
 pub use trust::{Standing, Trust};

@@ -32,10 +32,15 @@ const WINDOW_FLOOR: u64 = 256 * 1024;
 /// Stream bytes under way at once: a model on a thin link must not fill the queue in front of stops and
 /// pongs for as long as it is (100 kB, 13 s at 64 kbit/s; so it is 4 s), and on a usual one must not take long
 /// either (three round trips and their delayed acknowledgements).
-const SEND_WINDOW: u64 = 32 * 1024;
+pub(crate) const SEND_WINDOW: u64 = 32 * 1024;
 
 /// Datagrams QUIC may hold back: two of ours, each with quinn's 32 B of bookkeeping. The newest wins.
 const DATAGRAM_SEND_BUFFER: usize = 2 * (v1::MAX_DATAGRAM_LEN + 32);
+
+/// A packet is lost when one that was sent later has been acknowledged for a while, not when some have overtaken it
+/// (RFC 9002 §6.1.1 allows either): jitter of a few ms reorders whatever is sent in one go, and quinn's three would
+/// send half of a model twice. More than are ever under way.
+const PACKET_THRESHOLD: u32 = 1024;
 
 /// Stream bytes held for a session that does not read them yet, twice what this implementation has under way.
 const RECEIVE_WINDOW: u32 = 64 * 1024;
@@ -49,19 +54,26 @@ const INCOMING_BUFFER: u64 = 8 * 1024;
 /// Cubic does not grow while the application sends little, and quinn sends nothing while
 /// `in_flight + MTU` exceeds the window: at 1 kHz over 40 ms and 1 % loss that costs 69 ms at the median.
 /// The application's own rate (tens of messages a second) is the real limit.
-struct Floored(Box<dyn Controller>);
+struct Floored {
+    cubic: Box<dyn Controller>,
+    /// The least round trip of the connection.
+    least_rtt: Option<Duration>,
+}
 
 struct FlooredConfig(Arc<CubicConfig>);
 
 impl ControllerFactory for FlooredConfig {
     fn build(self: Arc<Self>, now: Instant, current_mtu: u16) -> Box<dyn Controller> {
-        Box::new(Floored(Arc::clone(&self.0).build(now, current_mtu)))
+        Box::new(Floored {
+            cubic: Arc::clone(&self.0).build(now, current_mtu),
+            least_rtt: None,
+        })
     }
 }
 
 impl Controller for Floored {
     fn on_sent(&mut self, now: Instant, bytes: u64, last_packet_number: u64) {
-        self.0.on_sent(now, bytes, last_packet_number);
+        self.cubic.on_sent(now, bytes, last_packet_number);
     }
 
     fn on_ack(
@@ -72,7 +84,8 @@ impl Controller for Floored {
         app_limited: bool,
         rtt: &RttEstimator,
     ) {
-        self.0.on_ack(now, sent, bytes, app_limited, rtt);
+        self.least_rtt = Some(rtt.min());
+        self.cubic.on_ack(now, sent, bytes, app_limited, rtt);
     }
 
     fn on_end_acks(
@@ -82,7 +95,7 @@ impl Controller for Floored {
         app_limited: bool,
         largest: Option<u64>,
     ) {
-        self.0.on_end_acks(now, in_flight, app_limited, largest);
+        self.cubic.on_end_acks(now, in_flight, app_limited, largest);
     }
 
     fn on_congestion_event(
@@ -92,33 +105,45 @@ impl Controller for Floored {
         persistent: bool,
         lost_bytes: u64,
     ) {
-        self.0
+        self.cubic
             .on_congestion_event(now, sent, persistent, lost_bytes);
     }
 
     fn on_mtu_update(&mut self, new_mtu: u16) {
-        self.0.on_mtu_update(new_mtu);
+        self.cubic.on_mtu_update(new_mtu);
     }
 
     fn window(&self) -> u64 {
-        self.0.window().max(WINDOW_FLOOR)
+        self.cubic.window().max(WINDOW_FLOOR)
     }
 
     fn metrics(&self) -> ControllerMetrics {
-        self.0.metrics()
+        self.cubic.metrics()
     }
 
     fn clone_box(&self) -> Box<dyn Controller> {
-        Box::new(Self(self.0.clone_box()))
+        Box::new(Self {
+            cubic: self.cubic.clone_box(),
+            least_rtt: self.least_rtt,
+        })
     }
 
     fn initial_window(&self) -> u64 {
-        self.0.initial_window().max(WINDOW_FLOOR)
+        self.cubic.initial_window().max(WINDOW_FLOOR)
     }
 
     fn into_any(self: Box<Self>) -> Box<dyn Any> {
         self
     }
+}
+
+/// The least round trip of a connection so far; the smoothed one as long as nothing has been acknowledged.
+pub fn least_rtt(connection: &quinn::Connection) -> Duration {
+    let controller = connection.congestion_state().into_any();
+    let least = controller.downcast::<Floored>().ok();
+    least
+        .and_then(|floored| floored.least_rtt)
+        .unwrap_or_else(|| connection.rtt())
 }
 
 fn transport() -> TransportConfig {
@@ -132,6 +157,7 @@ fn transport() -> TransportConfig {
         ))))
         .keep_alive_interval(Some(KEEP_ALIVE))
         .send_window(SEND_WINDOW)
+        .packet_threshold(PACKET_THRESHOLD)
         .datagram_send_buffer_size(DATAGRAM_SEND_BUFFER)
         .datagram_receive_buffer_size(Some(64 * 1024))
         .stream_receive_window(VarInt::from_u32(RECEIVE_WINDOW))

@@ -237,6 +237,8 @@ pub enum Cause {
     ClockStep,
     /// The robot fell behind its own work.
     Fault,
+    /// What drives the arm failed, or says what cannot be.
+    ArmFault,
 }
 
 /// Why a request is declined.
@@ -373,6 +375,8 @@ pub enum RobotDatagram {
     },
     /// How the robot is.
     Telemetry(Telemetry),
+    /// What has become of the operator's motions on their way.
+    Reception(Reception),
 }
 
 /// How the robot is.
@@ -396,9 +400,9 @@ pub struct Telemetry {
     pub delay_ms: u16,
     /// Path knots held without a gap: everything before this number is acknowledged.
     pub path_frontier: u32,
-    /// Motions received, of those sent up to the newest.
+    /// Motions and goes of the session that arrived, each counted once.
     pub received: u32,
-    /// Number of the newest motion.
+    /// The highest number of one that has arrived.
     pub newest_seq: u32,
     /// Motions dropped: late, foreign, malformed.
     pub dropped: u32,
@@ -418,6 +422,31 @@ pub struct Telemetry {
     pub grip: Option<u8>,
     /// Joint positions, rad or m.
     pub q: Vec<f32>,
+}
+
+/// What has become of the operator's motions on their way, since the session began.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Reception {
+    /// The session's epoch.
+    pub epoch: u32,
+    /// The highest number of a motion or go that has arrived.
+    pub newest_seq: u32,
+    /// Numbers that arrived, each counted once: the others up to the newest are lost, or late.
+    pub received: u32,
+    /// Arrivals of a number that had arrived before.
+    pub duplicates: u32,
+    /// Arrivals after a higher number.
+    pub reordered: u32,
+    /// Runs of consecutive numbers that did not arrive.
+    pub loss_runs: u32,
+    /// The longest of them.
+    pub longest_loss_run: u32,
+    /// Interarrival jitter (RFC 3550 §6.4.1), µs.
+    pub jitter_us: u32,
+    /// One-way delay on the estimated clock: mean, median, 95 % quantile, largest, µs.
+    pub delay_us: [u32; 4],
+    /// Age of the hand state that was followed, over the servo ticks: the same four, µs.
+    pub age_us: [u32; 4],
 }
 
 /// A message of this version that can be decoded from untrusted bytes.
@@ -571,7 +600,7 @@ impl OperatorDatagram {
 impl RobotDatagram {
     fn check(&self) -> Result<(), DecodeError> {
         match self {
-            Self::Ping { .. } => Ok(()),
+            Self::Ping { .. } | Self::Reception(_) => Ok(()),
             Self::Telemetry(telemetry) => {
                 require(
                     telemetry.q.len() <= MAX_JOINTS,

@@ -251,6 +251,21 @@ fn telemetry(draw: &mut Draw) -> Telemetry {
     }
 }
 
+fn reception(draw: &mut Draw) -> Reception {
+    Reception {
+        epoch: draw.u32(),
+        newest_seq: draw.u32(),
+        received: draw.u32(),
+        duplicates: draw.u32(),
+        reordered: draw.u32(),
+        loss_runs: draw.u32(),
+        longest_loss_run: draw.u32(),
+        jitter_us: draw.u32(),
+        delay_us: std::array::from_fn(|_| draw.u32()),
+        age_us: std::array::from_fn(|_| draw.u32()),
+    }
+}
+
 pub(crate) fn messages() -> Vec<Vector> {
     let draw = &mut Draw::new(1);
     let id: ModelId = std::array::from_fn(|i| 17 * i as u8);
@@ -384,6 +399,13 @@ pub(crate) fn messages() -> Vec<Vector> {
         };
         all.push(message(ROBOT_CONTROL, format!("state: {cause:?}"), &m));
     }
+    // Came later: what is drawn for the others stays.
+    let m = RobotControl::State {
+        state: RobotState::Stopped,
+        cause: Cause::ArmFault,
+        changes: 3,
+    };
+    all.push(message(ROBOT_CONTROL, "state: ArmFault", &m));
     for (i, n) in [0, 0, 1, 2, 3, 5, 8, 13, 21, 32].into_iter().enumerate() {
         let m = OperatorDatagram::Motion(motion(draw, n));
         all.push(message(OPERATOR_DATAGRAM, format!("motion {i}"), &m));
@@ -414,6 +436,11 @@ pub(crate) fn messages() -> Vec<Vector> {
     for i in 0..8 {
         let m = RobotDatagram::Telemetry(telemetry(draw));
         all.push(message(ROBOT_DATAGRAM, format!("telemetry {i}"), &m));
+    }
+    // After all others, which would otherwise be drawn anew.
+    for i in 0..4 {
+        let m = RobotDatagram::Reception(reception(draw));
+        all.push(message(ROBOT_DATAGRAM, format!("reception {i}"), &m));
     }
     all
 }

@@ -326,7 +326,7 @@ fn control(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
     say(
         ROBOT_CONTROL,
         "an unknown cause",
-        vec![5, 0, 10, 0],
+        vec![5, 0, 11, 0],
         "Malformed",
     );
 }

@@ -50,7 +50,7 @@ impl<'a> Input<'a> {
 
 struct Bench {
     session: Session,
-    core: servo::Core,
+    core: servo::Station,
     handle: Handle,
     info: Info,
     now: Mono,
@@ -103,7 +103,7 @@ impl Bench {
                         self.pings.push(t1_us);
                         self.pings.truncate(8);
                     }
-                    Ok(RobotDatagram::Telemetry(_)) => {}
+                    Ok(RobotDatagram::Telemetry(_) | RobotDatagram::Reception(_)) => {}
                     Err(e) => panic!("{e}"),
                 },
                 Output::Order(order) => self.order(order),

@@ -12,6 +12,7 @@
 use std::sync::Arc;
 
 use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
 use telemime_sim::arm::{ArmModel, JointKind, Joints, Kinematics, SelfCollision};
 
 /// The most planes a workspace has.
@@ -27,7 +28,7 @@ const SOFT_M: f64 = HARD_M + 0.001;
 const LOOKS: usize = 16;
 
 /// A half-space that the tip must stay in, and every link behind it that begins there.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Plane {
     normal: Vector3<f64>,
     offset_m: f64,
@@ -56,7 +57,7 @@ impl Plane {
 }
 
 /// What is kept apart, and how early.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct BarrierConfig {
     /// Whether links are kept apart from each other.
     pub self_collision: bool,
@@ -257,6 +258,16 @@ impl Barrier {
             kinematics,
             known: (*start, f64::NEG_INFINITY),
         })
+    }
+
+    /// All that a later tick depends on: a posture, and the room there, m.
+    pub(super) fn known(&self) -> &(Joints, f64) {
+        &self.known
+    }
+
+    /// Goes on from what was once [known](Self::known).
+    pub(super) fn restore(&mut self, known: (Joints, f64)) {
+        self.known = known;
     }
 
     /// The nearest place that no plane excludes, and whether that is another one.

@@ -3,10 +3,13 @@
 use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
-use telemime_sim::arm::{ArmModel, DeadTime, DeadTimeError, Joints, PlantError, check_start};
+use serde::{Deserialize, Serialize};
+use telemime_sim::arm::{
+    ArmModel, DeadTime, DeadTimeError, Joints, MAX_DEAD_TIME_S, PlantError, check_start,
+};
 
 use super::barrier::Barrier;
-use super::ik::{DifferentialIk, quaternion};
+use super::ik::{DifferentialIk, IkState, quaternion};
 use super::turn::checked;
 use super::{
     BarrierConfig, BarrierError, CartesianLimits, ComputedTorque, FilterConfig, FilterError,
@@ -21,7 +24,7 @@ const LEASH_M: f64 = 0.002;
 const LEASH_RAD: f64 = 0.05;
 
 /// Bandwidth, limits and gains of a [`Controller`].
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ControlConfig {
     /// The filter's poles lie at −ω, rad/s: the tip lags the demand by 3/ω.
     pub omega: f64,
@@ -218,11 +221,50 @@ pub struct Output {
     pub orientation: UnitQuaternion<f64>,
     /// The angle from there to the orientation demanded, or to the one being kept, rad: of a demand that turns, what is due only [`Controller::lag_s`] later is part of it.
     pub orientation_error_rad: f64,
-    /// The setpoint that the joints' drives follow at this tick, rad or m: the reference of the dead time ago.
-    pub q_ref: Joints,
+    /// The setpoint that the joints' drives follow at this tick: the reference of the dead time ago.
+    pub setpoint: JointReference,
     /// What was clamped.
     pub clamps: Clamps,
 }
+
+/// All of a [`Controller`] that a later tick depends on.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct ControllerState {
+    filter: FilterState,
+    turn: TurnState,
+    turns: bool,
+    ik: IkState,
+    /// On their way, the next one due first.
+    setpoints: Vec<JointReference>,
+}
+
+impl ControllerState {
+    /// One that any controller can be saved into without an allocation.
+    pub fn with_room(dt_s: f64) -> Self {
+        let most = (MAX_DEAD_TIME_S / dt_s).round() as usize;
+        Self {
+            setpoints: Vec::with_capacity(most),
+            ..Self::default()
+        }
+    }
+}
+
+impl ControllerState {
+    /// A copy with as much room for setpoints.
+    pub(crate) fn roomy_clone(&self) -> Self {
+        let mut setpoints = Vec::with_capacity(self.setpoints.capacity());
+        setpoints.extend_from_slice(&self.setpoints);
+        Self {
+            setpoints,
+            ..self.clone()
+        }
+    }
+}
+
+/// A state that another kind of controller has saved.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the state is that of a controller with another dead time")]
+pub struct ForeignState;
 
 /// Filter, inverse kinematics and computed torque in one fixed tick.
 #[derive(Clone, Debug)]
@@ -365,6 +407,35 @@ impl Controller {
         tip
     }
 
+    /// Where the joints' reference is.
+    pub fn joint_reference(&self) -> &JointReference {
+        self.ik.reference()
+    }
+
+    /// All that a later tick depends on, into `state`; allocates nothing if that has held the state of this controller before, or room for it.
+    pub fn save(&self, state: &mut ControllerState) {
+        state.filter = *self.filter.state();
+        state.turn = self.turn.state();
+        state.turns = self.turns;
+        state.ik = self.ik.save();
+        self.setpoints.save(&mut state.setpoints);
+    }
+
+    /// Goes on from `state`, which a controller of the same arm and configuration has saved.
+    ///
+    /// # Errors
+    /// [`ForeignState`] for one of another dead time.
+    pub fn restore(&mut self, state: &ControllerState) -> Result<(), ForeignState> {
+        if !self.setpoints.restore(&state.setpoints) {
+            return Err(ForeignState);
+        }
+        self.filter.restore(state.filter);
+        self.turn.restore(state.turn);
+        self.turns = state.turns;
+        self.ik.restore(&state.ik);
+        Ok(())
+    }
+
     /// One tick at the measured `q` (rad, m) and `qd` (rad/s, m/s).
     pub fn tick(&mut self, demand: Demand, q: &Joints, qd: &Joints) -> Output {
         let now = (*self.filter.state(), *self.ik.reference());
@@ -418,7 +489,7 @@ impl Controller {
             tip: kinematics.tip(),
             orientation,
             orientation_error_rad: orientation.angle_to(&asked),
-            q_ref: joints.q,
+            setpoint: joints,
             clamps,
         }
     }

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Rotation3, SMatrix, SymmetricEigen, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
 use telemime_sim::arm::{ArmModel, Jacobian, Joints, Kinematics, MAX_JOINTS};
 
 use super::barrier::Barrier;
@@ -42,7 +43,7 @@ pub struct IkConfig {
 }
 
 /// Joint positions, velocities and accelerations that the torque control follows.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct JointReference {
     /// Position, rad or m.
     pub q: Joints,
@@ -50,6 +51,19 @@ pub struct JointReference {
     pub qd: Joints,
     /// Acceleration until the next tick, rad/s² or m/s².
     pub qdd: Joints,
+}
+
+/// All of a [`DifferentialIk`] that a later step depends on.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
+pub(super) struct IkState {
+    orientation: Matrix3<f64>,
+    secondary_share: f64,
+    reference: JointReference,
+    turn_share: f64,
+    tip_velocity: Vector3<f64>,
+    angular_velocity: Vector3<f64>,
+    /// A posture, and the room that the barrier found there.
+    barrier: (Joints, f64),
 }
 
 /// What a step ran into; bit `i` stands for joint `i`.
@@ -290,6 +304,37 @@ impl DifferentialIk {
         self.kinematics.update(&self.arm, q);
         self.orientation = *self.kinematics.tip_rotation();
         self.kinematics.tip()
+    }
+
+    pub(super) fn save(&self) -> IkState {
+        IkState {
+            orientation: self.orientation,
+            secondary_share: self.secondary_share,
+            reference: self.reference,
+            turn_share: self.turn_share,
+            tip_velocity: self.tip_velocity,
+            angular_velocity: self.angular_velocity,
+            barrier: *self.barrier.known(),
+        }
+    }
+
+    pub(super) fn restore(&mut self, state: &IkState) {
+        let IkState {
+            orientation,
+            secondary_share,
+            reference,
+            turn_share,
+            tip_velocity,
+            angular_velocity,
+            barrier,
+        } = *state;
+        self.orientation = orientation;
+        self.secondary_share = secondary_share;
+        self.reference = reference;
+        self.turn_share = turn_share;
+        self.tip_velocity = tip_velocity;
+        self.angular_velocity = angular_velocity;
+        self.barrier.restore(barrier);
     }
 
     /// The nearest place that no plane excludes, and whether that is another one.

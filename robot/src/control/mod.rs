@@ -16,7 +16,8 @@ mod tests;
 
 pub use barrier::{BarrierConfig, BarrierError, MAX_PLANES, Plane};
 pub use controller::{
-    ClampCounts, Clamps, ControlConfig, ControlError, Controller, Demand, Output,
+    ClampCounts, Clamps, ControlConfig, ControlError, Controller, ControllerState, Demand,
+    ForeignState, Output,
 };
 pub use filter::{FilterConfig, FilterError, FilterState, LimitedFilter};
 pub use ik::{IkConfig, JointReference, JointStep};

@@ -11,7 +11,8 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use nalgebra::{Quaternion, UnitQuaternion};
-use telemime_endpoint::Mono;
+use telemime_endpoint::reception::{Quantiles, Received, Reception, Spread};
+use telemime_endpoint::{Mono, Pacer};
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
@@ -19,8 +20,8 @@ use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::turn::{WireRotation, dequantise_grip, quantise_grip};
 use telemime_protocol::wire::v1::{
-    Cause, Drive, Engage, ExternalClock, Info, MAX_PLAN_LEN, Message, ModelId, OperatorControl,
-    OperatorDatagram, Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
+    self, Cause, Drive, Engage, ExternalClock, Info, MAX_PLAN_LEN, Message, ModelId,
+    OperatorControl, OperatorDatagram, Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
 };
 use telemime_protocol::wire::{DecodeError, Version, Versions};
 
@@ -33,10 +34,16 @@ const QUICK_PINGS: u32 = 8;
 const QUICK_PING_S: f64 = 0.02;
 const PING_S: f64 = 0.25;
 
+/// Every so many pings the operator is told what has become of its motions, in the same packet.
+const RECEPTION_PINGS: u32 = 4;
+
+/// On a link that is too thin for it, telemetry is this far apart, s: the operator gives the link up after a second.
+const RAREST_TELEMETRY_S: f64 = 0.4;
+
 /// What a session is set to.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SessionConfig {
-    /// Interval of telemetry, s.
+    /// Interval of telemetry, s, unless the link is too thin for it.
     pub telemetry_s: f64,
     /// A sample that took longer than this to arrive authorises nothing beyond, s.
     pub max_delay_s: f64,
@@ -87,10 +94,21 @@ pub struct TickTiming {
 /// What the session counts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Motions received, duplicates not counted.
+    /// Motions and goes of the session that arrived, each counted once.
     pub received: u32,
     /// Datagrams dropped: malformed, foreign, late or impossible.
     pub dropped: u32,
+}
+
+/// What has become of the datagrams of a session.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Seen {
+    /// The operator's motions and goes.
+    pub up: Received,
+    /// One-way delay of the pings to the operator, by the exchanges.
+    pub down: Option<Quantiles>,
+    /// Age of the hand state that was followed, over the servo's ticks.
+    pub age: Option<Quantiles>,
 }
 
 /// One operator's session.
@@ -111,7 +129,11 @@ pub struct Session {
     acknowledged: u32,
     newest_seq: u32,
     delay_s: f64,
-    counters: Counters,
+    dropped: u32,
+    reception: Reception,
+    ages: Spread,
+    down: Spread,
+    pacer: Pacer,
     report: Option<Report>,
     transitions: Option<u32>,
     timing: TickTiming,
@@ -146,7 +168,11 @@ impl Session {
             acknowledged: 0,
             newest_seq: 0,
             delay_s: 0.0,
-            counters: Counters::default(),
+            dropped: 0,
+            reception: Reception::default(),
+            ages: Spread::default(),
+            down: Spread::default(),
+            pacer: Pacer::new(config.telemetry_s, RAREST_TELEMETRY_S),
             report: None,
             transitions: None,
             timing: TickTiming::default(),
@@ -186,7 +212,19 @@ impl Session {
 
     /// The counters.
     pub fn counters(&self) -> Counters {
-        self.counters
+        Counters {
+            received: self.reception.received(),
+            dropped: self.dropped,
+        }
+    }
+
+    /// What has become of the session's datagrams on their way.
+    pub fn seen(&self) -> Seen {
+        Seen {
+            up: self.reception.summary(),
+            down: self.down.quantiles(),
+            age: self.ages.quantiles(),
+        }
     }
 
     /// The path received in mirror, if one is being followed.
@@ -205,7 +243,7 @@ impl Session {
             Err(e) => return Err(e),
         };
         match message {
-            OperatorControl::Model { id, bytes } => self.store_model(id, &bytes),
+            OperatorControl::Model { id, bytes } => self.store_model(now, id, &bytes),
             OperatorControl::Plan { id, bytes } => {
                 match codec::decode::<PosePlan, MAX_PLAN_LEN>(&bytes) {
                     Ok(plan) => {
@@ -242,7 +280,10 @@ impl Session {
     /// A datagram. Nothing in it can end the session: what is wrong is dropped and counted.
     pub fn handle_datagram(&mut self, now: Mono, bytes: &[u8]) {
         let taken = match self.version.decode_operator_datagram(bytes) {
-            Ok(OperatorDatagram::Motion(motion)) => self.on_motion(now, &motion),
+            Ok(OperatorDatagram::Motion(motion)) => {
+                self.arrived(now, motion.epoch, motion.seq, motion.state.t_us);
+                self.on_motion(now, &motion)
+            }
             Ok(OperatorDatagram::Go {
                 epoch,
                 engagement,
@@ -251,6 +292,7 @@ impl Session {
                 lease_ms,
                 bend,
             }) => {
+                self.arrived(now, epoch, seq, t_us);
                 let ours = epoch == self.epoch && engagement == self.engagement;
                 ours && self.on_go(now, seq, t_us, lease_ms, bend.as_ref())
             }
@@ -268,6 +310,7 @@ impl Session {
                     now,
                 );
                 self.follow_clock(now);
+                self.pace(now, Mono(t1_us.saturating_mul(1000)), stamp(t2_us));
                 true
             }
             Ok(OperatorDatagram::Clock {
@@ -295,7 +338,25 @@ impl Session {
             | Err(_) => false,
         };
         if !taken {
-            self.counters.dropped += 1;
+            self.dropped += 1;
+        }
+    }
+
+    /// A motion or go has come, whatever becomes of it.
+    fn arrived(&mut self, now: Mono, epoch: u32, seq: u32, t_us: i64) {
+        if epoch == self.epoch {
+            let said_at = self.clock.to_mono(Stamp(t_us.saturating_mul(1000)));
+            self.reception
+                .arrive(seq, said_at.map(|at| now.secs_since(at)));
+        }
+    }
+
+    /// A ping sent at `t1` was heard at `t2`: telemetry takes the same way.
+    fn pace(&mut self, now: Mono, t1: Mono, t2: Stamp) {
+        if let Some(sent) = self.clock.to_session(t1) {
+            let down_s = t2.secs_since(sent);
+            self.down.add(down_s);
+            self.pacer.observe(now.0 as f64 * 1e-9, down_s, false);
         }
     }
 
@@ -305,6 +366,10 @@ impl Session {
         let changed = self.transitions != Some(report.transitions);
         self.transitions = Some(report.transitions);
         self.report = Some(*report);
+        let follows = matches!(report.state, RobotState::Engaged | RobotState::Coasting);
+        if follows && self.mirror.is_some() {
+            self.ages.add(report.age_s);
+        }
         let pending = self.acknowledged != self.engagement;
         if pending && report.engagement == self.ticket() {
             self.acknowledged = self.engagement;
@@ -351,9 +416,13 @@ impl Session {
                 t1_us: now.0 / 1000,
             };
             self.outputs.push_back(Output::Datagram(ping.encode()));
+            if self.pings.is_multiple_of(RECEPTION_PINGS) && self.reception.newest() > 0 {
+                let reception = RobotDatagram::Reception(self.told());
+                self.outputs.push_back(Output::Datagram(reception.encode()));
+            }
         }
         if now >= self.next_telemetry {
-            self.next_telemetry = now.offset_by_secs(self.config.telemetry_s);
+            self.next_telemetry = now.offset_by_secs(self.pacer.interval_s());
             if let Some(telemetry) = self.telemetry(now) {
                 let datagram = RobotDatagram::Telemetry(telemetry).encode();
                 self.outputs.push_back(Output::Datagram(datagram));
@@ -380,7 +449,7 @@ impl Session {
         }
     }
 
-    fn store_model(&mut self, id: ModelId, bytes: &[u8]) {
+    fn store_model(&mut self, now: Mono, id: ModelId, bytes: &[u8]) {
         match Skill::from_bytes(bytes) {
             Ok(skill) if skill.id().0 == id => {
                 // What is being followed goes on with the model it began with: another one would be a jump.
@@ -391,6 +460,8 @@ impl Session {
                     (self.skill, self.next_skill) = (skill, None);
                 }
                 self.send(&RobotControl::ModelStored { id });
+                // What was asked meanwhile waited behind the model: ask again before anybody engages by the answers.
+                (self.pings, self.next_ping) = (0, now);
             }
             _ => self.refuse(Refusal::BadModel),
         }
@@ -470,7 +541,7 @@ impl Session {
                     return Err(Refusal::BadPlan);
                 }
                 (
-                    Source::Play(Box::new(Trajectory { curve, duration_s })),
+                    Source::Play(Arc::new(Trajectory { curve, duration_s })),
                     None,
                 )
             }
@@ -479,6 +550,7 @@ impl Session {
         self.mirror = mirror;
         self.order(Order::Engage(Engagement {
             ticket: self.ticket(),
+            model: self.skill.as_ref().map(|skill| skill.id().0),
             source,
             scale: f64::from(engage.scale),
             rotation,
@@ -496,6 +568,28 @@ impl Session {
             .is_some_and(|r| matches!(r.state, RobotState::Engaged | RobotState::Coasting));
         if self.clock.slew(now, following) == Slew::Step {
             self.brake(Cause::ClockStep);
+        }
+    }
+
+    /// What the operator is told of its motions.
+    fn told(&self) -> v1::Reception {
+        let us = |s: f64| (s * 1e6).round().clamp(0.0, f64::from(u32::MAX)) as u32;
+        let four = |times: Option<Quantiles>| {
+            let t = times.unwrap_or_default();
+            [t.mean_s, t.p50_s, t.p95_s, t.max_s].map(us)
+        };
+        let Seen { up, age, .. } = self.seen();
+        v1::Reception {
+            epoch: self.epoch,
+            newest_seq: self.reception.newest(),
+            received: up.received,
+            duplicates: up.duplicates,
+            reordered: up.reordered,
+            loss_runs: up.loss_runs,
+            longest_loss_run: up.longest_loss_run,
+            jitter_us: us(up.jitter_s),
+            delay_us: four(up.delay),
+            age_us: four(age),
         }
     }
 
@@ -521,9 +615,9 @@ impl Session {
             age_ms: milliseconds(report.age_s),
             delay_ms: milliseconds(self.delay_s),
             path_frontier: self.mirror.as_ref().map_or(0, Mirror::frontier),
-            received: self.counters.received,
-            newest_seq: self.newest_seq,
-            dropped: self.counters.dropped,
+            received: self.reception.received(),
+            newest_seq: self.reception.newest(),
+            dropped: self.dropped,
             clamps: report.clamps,
             tick_mean_ns: self.timing.mean_ns,
             tick_p99_ns: self.timing.p99_ns,
@@ -545,7 +639,7 @@ impl Session {
         let Some(report) = self.report.filter(|r| r.state == RobotState::Stopped) else {
             return;
         };
-        if report.cause == Cause::LocalStop || report.transitions != changes {
+        if report.cause != Cause::OperatorStop || report.transitions != changes {
             return self.refuse(Refusal::NotYours);
         }
         self.order(Order::Reset {

@@ -50,7 +50,6 @@ impl Session {
         let fresh = motion.seq > self.newest_seq;
         if fresh {
             self.newest_seq = motion.seq;
-            self.counters.received += 1;
         }
         // Newest by sample time: reordering and repetition never take the robot back.
         if state.t <= mirror.newest_t {
@@ -115,7 +114,6 @@ impl Session {
             return false;
         };
         self.newest_seq = seq;
-        self.counters.received += 1;
         self.delay_s = age_s;
         let ticket = self.ticket();
         self.order(Order::Extend {

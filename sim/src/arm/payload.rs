@@ -60,7 +60,7 @@ pub enum PayloadError {
 /// assert_eq!(cup.body().com_m.z, 0.06);
 /// # Ok::<(), telemime_sim::arm::PayloadError>(())
 /// ```
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Payload {
     body: Body,
 }

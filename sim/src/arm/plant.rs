@@ -240,8 +240,8 @@ impl Plant {
 
     /// Takes the state over, held by the stops; returns which of them held.
     fn arrive(&mut self, q: Joints, qd: Joints) -> u16 {
-        // An unlimited joint under an absurd torque overflows: it is left where it was.
-        if !q.iter().all(|v| v.is_finite()) {
+        // What overflows (an unlimited joint under an absurd torque, an explicit rule under stiff friction) is left where it was.
+        if !q.iter().chain(qd.iter()).all(|v| v.is_finite()) {
             self.qd = Joints::zeros();
             return 0;
         }

@@ -53,13 +53,19 @@ fn panel(title: &str, x: &str, y: &str, layers: Vec<Layer>) -> Option<Panel> {
     })
 }
 
+/// (x, mean).
+type Means = Vec<(f64, f64)>;
+
+/// (x, low, high).
+type Bands = Vec<(f64, f64, f64)>;
+
 /// Mean and interval of `figure` over x, of one method; groups with the same x are pooled.
 fn course_over(
     groups: &[&Group<'_>],
     x: impl Fn(&Group<'_>) -> Option<f64>,
     figure: &str,
     unit: f64,
-) -> (Vec<(f64, f64)>, Vec<(f64, f64, f64)>) {
+) -> (Means, Bands) {
     let mut places: Vec<f64> = groups.iter().filter_map(|g| x(g)).collect();
     places.sort_by(f64::total_cmp);
     places.dedup();

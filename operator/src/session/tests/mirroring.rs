@@ -475,3 +475,69 @@ fn however_fast_the_samples_come_motions_keep_their_distance() {
     let close = |w: &[Stamp]| w[1].secs_since(w[0]) < 0.01 - 1e-9;
     assert!(!said[1..].windows(2).any(close));
 }
+
+#[test]
+fn before_the_model_has_arrived_it_is_constant_velocity_and_stays_so_to_the_end() {
+    let skill = example(2, 24);
+    let id = skill.id().0;
+    let mut bench = Bench::fresh(bound(0.05), Some(skill));
+    bench.hears(&RobotControl::Info(info(None)));
+    let asked = |bench: &Bench| {
+        let drive = bench.control.iter().rev().find_map(|m| match m {
+            OperatorControl::Engage(Engage {
+                drive: Drive::Mirror { model, .. },
+                ..
+            }) => Some(*model),
+            _ => None,
+        });
+        drive.unwrap()
+    };
+    let wave = |i: u32| home() + Vector3::new((0.3 * f64::from(i)).sin(), 0.0, 0.0) * 0.3;
+    bench.sample(home());
+    bench.session.engage(bench.now);
+    bench.drain();
+    assert_eq!(asked(&bench), 0, "the model is still on its way");
+    for i in 0..20 {
+        bench.sample(wave(i));
+    }
+    // The robot, too, goes on with what it began with.
+    bench.hears(&RobotControl::ModelStored { id });
+    for i in 20..60 {
+        bench.sample(wave(i));
+    }
+    let motions = bench.motions();
+    assert!(motions.len() > 20, "{}", motions.len());
+    assert!(motions.iter().all(|m| m.model == 0));
+    let checked = motions.iter().filter_map(|m| m.checksum.map(|c| (c, m)));
+    for (sum, motion) in checked {
+        let (state, params) = (motion.state.dequantise(), motion.params.dequantise());
+        let plain = Forecast::constant_velocity(&state, &params);
+        assert_eq!(sum, checksum(&plain, None));
+    }
+    bench.session.release();
+    bench.session.engage(bench.now);
+    bench.drain();
+    assert_eq!(asked(&bench), model_tag(&id), "the next one has it");
+}
+
+#[test]
+fn what_is_new_is_said_again_where_much_is_lost_and_only_once() {
+    let mut bench = Bench::engaged(bound(0.02), None);
+    let lossy = |seq: u32, newest_seq: u32| Telemetry {
+        newest_seq,
+        received: newest_seq - newest_seq / 5,
+        ..telemetry(seq, 0)
+    };
+    let still = home();
+    bench.sample(still);
+    for i in 1..100 {
+        bench.receives(&RobotDatagram::Telemetry(lossy(i, 5 * i)));
+    }
+    bench.forget();
+    bench.sample(still + Vector3::new(0.2, 0.0, 0.0));
+    bench.idle(100);
+    let motions = bench.motions();
+    assert_eq!(motions.len(), 2, "once more, and no more");
+    assert_eq!(motions[0].state, motions[1].state);
+    assert_eq!(motions[1].seq, motions[0].seq + 1);
+}
