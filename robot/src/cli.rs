@@ -276,7 +276,9 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         Some(running.timing.clone()),
         desk,
     );
-    let daemon = daemon.with_external(dispersion.map(External::host));
+    let daemon = daemon
+        .with_external(dispersion.map(External::host))
+        .showing(rig.described());
     let (notices, heard) = mpsc::unbounded_channel();
     let listener = tokio::spawn(listen_to(heard, log.clone(), recorder));
     let served = tokio::select! {

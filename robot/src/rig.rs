@@ -3,9 +3,11 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use nalgebra::{Isometry3, Vector3};
+use telemime_protocol::wire::arm::{WireArm, WireCapsule, WireJoint, WireJointKind, WirePlace};
 use telemime_protocol::wire::v1::{Info, RobotState};
 use telemime_sim::arm::{
-    ArmError, ArmModel, Gripper, Joints, LoadOptions, Plant, PlantError, default_urdf,
+    ArmError, ArmModel, Gripper, JointKind, Joints, LoadOptions, Plant, PlantError, default_urdf,
 };
 
 use crate::control::{ControlConfig, ControlError, Controller, home_posture, workspace_radius};
@@ -173,6 +175,26 @@ impl Rig {
         }
     }
 
+    /// How the arm is built, for whoever draws it.
+    pub fn described(&self) -> WireArm {
+        let joint = |joint: &telemime_sim::arm::Joint| WireJoint {
+            place: place(&joint.placement),
+            axis: joint.axis.cast::<f32>().into(),
+            kind: match joint.kind {
+                JointKind::Revolute => WireJointKind::Revolute,
+                JointKind::Prismatic => WireJointKind::Prismatic,
+            },
+            limits: joint
+                .is_limited()
+                .then_some([joint.lower as f32, joint.upper as f32]),
+        };
+        WireArm {
+            joints: self.arm.joints().iter().map(joint).collect(),
+            tip: place(self.arm.tip_offset()),
+            capsules: capsules(&self.arm),
+        }
+    }
+
     /// A controller and a plant at the start posture, for a run without a session.
     pub fn parts(&self) -> (Controller, Plant) {
         (self.controller.clone(), self.plant.clone())
@@ -198,6 +220,47 @@ impl Rig {
             rings,
         )
     }
+}
+
+/// The first link is drawn this thick for an arm of a metre, m …
+const BASE_RADIUS: f64 = 0.065;
+
+/// … and the last one this much of it.
+const TAPER: f64 = 0.4;
+
+fn place(at: &Isometry3<f64>) -> WirePlace {
+    let q = at.rotation.cast::<f32>();
+    WirePlace {
+        m: at.translation.vector.cast::<f32>().into(),
+        q: [q.w, q.i, q.j, q.k],
+    }
+}
+
+/// A capsule from every joint to the next, thinner towards the tip. The last ends short of the tip, so that it is seen.
+fn capsules(arm: &ArmModel) -> Vec<WireCapsule> {
+    let ways = arm.joints().iter().map(|joint| &joint.placement);
+    let ways: Vec<Vector3<f64>> = ways
+        .chain([arm.tip_offset()])
+        .map(|at| at.translation.vector)
+        .collect();
+    let last = ways.len() - 1;
+    let thickest = BASE_RADIUS * ways.iter().map(Vector3::norm).sum::<f64>().clamp(0.1, 3.0);
+    let link = |(i, way): (usize, &Vector3<f64>)| {
+        let radius = thickest * (1.0 - (1.0 - TAPER) * i as f64 / last.max(1) as f64);
+        let to = if i == last { way * 0.8 } else { *way };
+        (to.norm() > 0.1 * radius).then(|| WireCapsule {
+            link: i as u8,
+            // The lowest stands on the floor, not in it.
+            from: if i == 0 {
+                (way * (radius / way.norm()).min(0.5)).cast::<f32>().into()
+            } else {
+                [0.0; 3]
+            },
+            to: to.cast::<f32>().into(),
+            radius_m: radius as f32,
+        })
+    };
+    ways.iter().enumerate().filter_map(link).collect()
 }
 
 #[cfg(test)]
