@@ -57,6 +57,7 @@ pub struct Relay {
     socket: Arc<UdpSocket>,
     config: RelayConfig,
     clock: HostClock,
+    shapes: watch::Receiver<Option<LinkConfig>>,
 }
 
 struct Packet {
@@ -83,7 +84,15 @@ impl Relay {
             socket,
             config,
             clock,
+            shapes: watch::channel(None).1,
         })
+    }
+
+    /// Takes on, in both directions, whatever is sent there; packets on their way arrive as they would have.
+    #[must_use]
+    pub fn shaped_by(mut self, shapes: watch::Receiver<Option<LinkConfig>>) -> Self {
+        self.shapes = shapes;
+        self
     }
 
     /// Where it listens.
@@ -95,7 +104,7 @@ impl Relay {
     }
 
     /// Passes packets on until `quit` turns true. `passages` hears of every packet once its fate is done.
-    pub async fn run(self, mut quit: watch::Receiver<bool>, mut passages: impl FnMut(Passage)) {
+    pub async fn run(mut self, mut quit: watch::Receiver<bool>, mut passages: impl FnMut(Passage)) {
         let mut up = Link::new(self.config.up.clone(), self.config.seed);
         let mut down = Link::new(
             self.config.down.clone(),
@@ -115,6 +124,14 @@ impl Relay {
             let packet = tokio::select! {
                 biased;
                 () = told(&mut quit) => break,
+                Ok(()) = self.shapes.changed() => {
+                    let shape = self.shapes.borrow_and_update().clone();
+                    if let Some(shape) = shape {
+                        up.reshape(shape.clone());
+                        down.reshape(shape);
+                    }
+                    continue;
+                }
                 () = sleep_until(next.unwrap_or_else(tokio::time::Instant::now)), if next.is_some() => {
                     let now = self.clock.now();
                     while let Some(&Reverse((at, id))) = due.peek() && at <= now.0 {

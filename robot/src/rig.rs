@@ -223,7 +223,7 @@ impl Rig {
 }
 
 /// The first link is drawn this thick for an arm of a metre, m …
-const BASE_RADIUS: f64 = 0.065;
+const BASE_RADIUS: f64 = 0.05;
 
 /// … and the last one this much of it.
 const TAPER: f64 = 0.4;
@@ -247,7 +247,8 @@ fn capsules(arm: &ArmModel) -> Vec<WireCapsule> {
     let thickest = BASE_RADIUS * ways.iter().map(Vector3::norm).sum::<f64>().clamp(0.1, 3.0);
     let link = |(i, way): (usize, &Vector3<f64>)| {
         let radius = thickest * (1.0 - (1.0 - TAPER) * i as f64 / last.max(1) as f64);
-        let to = if i == last { way * 0.8 } else { *way };
+        let short = if i == last { radius + 0.015 } else { 0.0 };
+        let to = way * (1.0 - short / way.norm().max(1e-9)).max(0.0);
         (to.norm() > 0.1 * radius).then(|| WireCapsule {
             link: i as u8,
             // The lowest stands on the floor, not in it.

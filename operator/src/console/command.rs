@@ -111,7 +111,9 @@ pub enum BadCommand {
         most: f64,
     },
     /// A name that is none.
-    #[error("a skill's name has 1 to {MAX_NAME} characters, none of them a slash, a dot in front or a control character")]
+    #[error(
+        "a skill's name has 1 to {MAX_NAME} characters, none of them a slash, a dot in front or a control character"
+    )]
     Name,
 }
 
@@ -167,7 +169,11 @@ impl Command {
             Self::Learn { name: given } => name(given)?,
             Self::Use { skill } => name(skill)?,
             Self::Link(shape) => shape.check()?,
-            Self::Alive {} | Self::Release {} | Self::Stop {} | Self::Reset {} | Self::Discard {} => {}
+            Self::Alive {}
+            | Self::Release {}
+            | Self::Stop {}
+            | Self::Reset {}
+            | Self::Discard {} => {}
         }
         Ok(command)
     }

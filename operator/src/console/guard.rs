@@ -121,7 +121,9 @@ impl Guard {
             return Ok(Pass::Known);
         }
         let given = request.query.unwrap_or_default();
-        let given = given.split('&').find_map(|pair| pair.strip_prefix("token="));
+        let given = given
+            .split('&')
+            .find_map(|pair| pair.strip_prefix("token="));
         if given.is_some_and(|given| token.is(given)) {
             return Ok(Pass::Token);
         }

@@ -57,7 +57,9 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; i
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
     /// The address cannot be had.
-    #[error("cannot serve the page at {addr}: {source}; choose another address with --console ADDR")]
+    #[error(
+        "cannot serve the page at {addr}: {source}; choose another address with --console ADDR"
+    )]
     Bind {
         /// Where.
         addr: SocketAddr,
@@ -235,7 +237,11 @@ struct Frame<'a> {
     now: Now<'a>,
 }
 
-async fn tell(out: &mut SplitSink<WebSocket, Message>, shared: &Shared, number: u64) -> Option<String> {
+async fn tell(
+    out: &mut SplitSink<WebSocket, Message>,
+    shared: &Shared,
+    number: u64,
+) -> Option<String> {
     let mut snapshots = shared.port.snapshots.clone();
     snapshots.mark_changed();
     let mut told: Option<Arc<WireArm>> = None;
@@ -244,7 +250,8 @@ async fn tell(out: &mut SplitSink<WebSocket, Message>, shared: &Shared, number: 
         let begun = Instant::now();
         let snapshot = Arc::clone(&snapshots.borrow_and_update());
         let built = snapshot.built.as_ref();
-        let fresh = built.filter(|built| told.as_ref().is_none_or(|told| !Arc::ptr_eq(told, built)));
+        let fresh =
+            built.filter(|built| told.as_ref().is_none_or(|told| !Arc::ptr_eq(told, built)));
         let frame = Frame {
             arm: fresh.map(AsRef::as_ref),
             now: Now {
@@ -344,13 +351,21 @@ struct Placed {
 }
 
 impl AsyncRead for Placed {
-    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        buf: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
         Pin::new(&mut self.stream).poll_read(cx, buf)
     }
 }
 
 impl AsyncWrite for Placed {
-    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        buf: &[u8],
+    ) -> Poll<io::Result<usize>> {
         Pin::new(&mut self.stream).poll_write(cx, buf)
     }
 

@@ -55,6 +55,11 @@ impl Link {
         &self.config
     }
 
+    /// Is set to `config` from now on: its chances go on where they were, and what is queued leaves as it would have.
+    pub fn reshape(&mut self, config: LinkConfig) {
+        self.config = config;
+    }
+
     /// Sends a packet of `len_bytes` (headers included) at `now_ns`, which must not decrease between calls.
     pub fn send(&mut self, now_ns: i64, len_bytes: usize) -> Fate {
         // Both variates are always drawn, so that one packet's fate does not shift the next one's.

@@ -77,17 +77,15 @@ export class Drive extends EventTarget {
     this.dispatchEvent(new Event("change"));
   }
 
-  /** Once a frame: the keys move the hand, and the daemon hears that the clutch is still held. */
-  tick(dt) {
-    if (!this.what) return;
+  /** Some 100 times a second: the keys move the hand, and the daemon hears that the clutch is still held. */
+  tick(now) {
+    const dt = Math.min(0.05, (now - this.said) / 1000);
+    if (!this.what || now - this.said < 7.5) return;
+    this.said = now;
     for (const key of this.keys) {
       const [axis, sign] = MOVES[key];
       this.p = along(this.p, this.view[axis], sign * (this.fine ? KEY_FINE : KEY_SPEED) * dt);
     }
-    // 125 a second are enough, whatever the screen does.
-    const now = performance.now();
-    if (now - this.said < 7.5) return;
-    this.said = now;
     const said = this.what === "play" ? { do: "alive" } : { do: "hand", t: now, x: this.p };
     this.link.say(said, false);
   }

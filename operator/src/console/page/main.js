@@ -68,11 +68,13 @@ function measure(now) {
   before = { t: now.t, clamps: arm?.clamps ?? 0, ...sent };
 }
 
+// Beside the picture: whether the clutch is held does not depend on how fast the screen is.
+setInterval(() => drive.tick(performance.now()), 8);
+
 let previous = performance.now();
 function frame(time) {
-  const dt = Math.min(0.05, (time - previous) / 1000);
+  scene?.paced(time - previous);
   previous = time;
-  drive.tick(dt);
   const { now } = link;
   shown = smooth.at(performance.now()) ?? null;
   const held = drive.what === "hand" || drive.what === "record";

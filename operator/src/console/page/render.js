@@ -48,8 +48,8 @@ void main() {
   pixel = vec4(mix(colour.rgb, shaded, lit), colour.a * (1.0 - fog));
 }`;
 
-const SEGMENTS = 18;
-const RINGS = 5;
+const SEGMENTS = 14;
+const RINGS = 4;
 const FLOATS = 12;
 
 /** How an instance is drawn. */

@@ -22,6 +22,8 @@ export class Scene {
     this.canvas = canvas;
     this.view = view;
     this.renderer = new Renderer(canvas);
+    this.quality = 1;
+    this.pace = 16;
     const dark = matchMedia("(prefers-color-scheme: dark)");
     const choose = () => (this.colours = dark.matches ? DARK : LIGHT);
     dark.addEventListener("change", choose);
@@ -29,13 +31,19 @@ export class Scene {
   }
 
   fit() {
-    const ratio = Math.min(2, devicePixelRatio || 1);
+    const ratio = Math.min(2, devicePixelRatio || 1) * this.quality;
     const { clientWidth, clientHeight } = this.canvas;
     const [width, height] = [Math.round(clientWidth * ratio), Math.round(clientHeight * ratio)];
     if (this.canvas.width !== width || this.canvas.height !== height) {
       [this.canvas.width, this.canvas.height] = [width, height];
       this.view.resize(clientWidth, clientHeight);
     }
+  }
+
+  /** A machine that cannot keep up gets a coarser picture, not a later one. */
+  paced(dt_ms) {
+    this.pace += 0.05 * (Math.min(200, dt_ms) - this.pace);
+    if (this.pace > 45 && this.quality > 0.4) [this.quality, this.pace] = [this.quality * 0.7, 16];
   }
 
   /** `what`: arm, q, hand, ghost, trail, path, knots, targets; whatever is missing is not drawn. */
@@ -75,7 +83,7 @@ export class Scene {
       const at = posed.links[i + 1];
       const axis = rotate(at.q, joint.axis);
       const r = drum(arm, i + 1);
-      this.renderer.add("solid", along(at.p, axis, -r * 0.55), along(at.p, axis, r * 0.55), r, this.colours.joint);
+      this.renderer.add("solid", along(at.p, axis, -r * 0.7), along(at.p, axis, r * 0.7), r, this.colours.joint);
     });
     const { tip } = posed;
     this.renderer.add("solid", tip.p, tip.p, 0.009, this.colours.tip);
@@ -122,5 +130,5 @@ export class Scene {
 
 function drum(arm, link) {
   const own = arm.capsules.filter((c) => c.link === link || c.link === link - 1).map((c) => c.radius_m);
-  return Math.max(0.012, Math.min(...(own.length ? own : [0.04])) * 1.06);
+  return Math.max(0.012, Math.min(...(own.length ? own : [0.04])) * 0.88);
 }
