@@ -1,18 +1,16 @@
 //! The command line.
 
-use std::net::SocketAddr;
-use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::Context;
 use clap::{Parser, Subcommand};
-use telemime_endpoint::cli::{self as shell, one_line};
+use telemime_endpoint::admin;
+use telemime_endpoint::cli::one_line;
 use telemime_endpoint::peers::Role;
-use telemime_endpoint::{HostClock, admin};
-use telemime_sim::link::{LinkConfig, parse_duration_s, parse_probability, parse_rate_bit_s};
+use telemime_sim::link::{
+    LinkConfig, Loss, Rate, parse_duration_s, parse_probability, parse_rate_bit_s,
+};
 
-use crate::relay::{Passage, Relay, RelayConfig};
-use crate::{codec, demo, evaluate, ingest, paper, recognise, select, tap, teach};
+use crate::{codec, demo, evaluate, ingest, link, paper, recognise, select, tap, teach};
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
 /// network delay behind it.
@@ -59,7 +57,7 @@ enum Command {
     /// Measure the input's latency from taps on a table.
     Tap(tap::Args),
     /// A UDP relay that delays, loses and throttles what passes.
-    Link(LinkArgs),
+    Link(Box<link::Args>),
     /// Reproduce the tables of the source publication beside ours.
     Paper(paper::Args),
 }
@@ -78,7 +76,7 @@ pub(crate) struct Shape {
     pub(crate) loss: f64,
     /// Bottleneck [default: unlimited].
     #[arg(long, value_name = "RATE", value_parser = parse_rate_bit_s)]
-    pub(crate) rate: Option<f64>,
+    pub(crate) rate: Option<u64>,
     /// Seed of the link's chances.
     #[arg(long, default_value_t = 1)]
     pub(crate) link_seed: u64,
@@ -89,27 +87,50 @@ impl Shape {
         LinkConfig {
             delay_s: self.delay,
             jitter_s: self.jitter,
-            loss: self.loss,
-            rate_bit_s: self.rate,
+            loss: Loss::random(self.loss),
+            rate: self.rate.map(Rate::bits),
             ..LinkConfig::default()
         }
     }
 }
 
-/// A UDP relay that delays, loses and throttles what passes, the same in both directions.
-#[derive(clap::Args, Debug)]
-struct LinkArgs {
-    /// Where the operator sends to.
-    #[arg(long, value_name = "ADDR")]
-    listen: SocketAddr,
-    /// Where the robot listens.
-    #[arg(long, value_name = "HOST:PORT", value_parser = shell::resolve)]
-    to: SocketAddr,
+/// What a link does to packets, in each direction.
+#[derive(clap::Args, Debug, Clone)]
+pub(crate) struct Ways {
     #[command(flatten)]
-    shape: Shape,
-    /// Write every packet's fate to this CSV file.
-    #[arg(long, value_name = "FILE")]
-    record: Option<PathBuf>,
+    pub(crate) shape: Shape,
+    /// From the operator to the robot, in netem's words, instead of --delay, --jitter, --loss and --rate:
+    /// "delay 100ms 10ms distribution normal loss gemodel 1% 10% outage 5s..7s".
+    #[arg(long, value_name = "LINK")]
+    up: Option<LinkConfig>,
+    /// From the robot to the operator, likewise.
+    #[arg(long, value_name = "LINK")]
+    down: Option<LinkConfig>,
+}
+
+impl Ways {
+    /// From the operator to the robot.
+    pub(crate) fn up(&self) -> LinkConfig {
+        self.up.clone().unwrap_or_else(|| self.shape.config())
+    }
+
+    /// From the robot to the operator.
+    pub(crate) fn down(&self) -> LinkConfig {
+        self.down.clone().unwrap_or_else(|| self.shape.config())
+    }
+
+    /// In words.
+    pub(crate) fn describe(&self) -> String {
+        if self.up.is_some() || self.down.is_some() {
+            return format!("up: {}; down: {}", self.up(), self.down());
+        }
+        format!(
+            "{:.0} ± {:.0} ms and {:.1} % loss each way",
+            self.shape.delay * 1e3,
+            self.shape.jitter * 1e3,
+            self.shape.loss * 1e2
+        )
+    }
 }
 
 /// Parses the command line and runs it; the exit code is 0, 1 (failed, with one line on stderr) or 2 (usage).
@@ -133,7 +154,7 @@ pub fn main() -> ExitCode {
         Some(Command::Identity(args)) => admin::identity(args, Role::Operator),
         Some(Command::Pair(args)) => telemime_operator::cli::pair(args),
         Some(Command::Peers(args)) => admin::peers(args),
-        Some(Command::Link(args)) => link(args),
+        Some(Command::Link(args)) => link::run(args),
         Some(Command::Paper(args)) => paper::run(args),
     };
     match done {
@@ -143,72 +164,4 @@ pub fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
-}
-
-fn link(args: &LinkArgs) -> anyhow::Result<()> {
-    let mut record = match &args.record {
-        None => None,
-        Some(path) => {
-            let mut out = csv::Writer::from_path(path)
-                .with_context(|| format!("cannot write {}", path.display()))?;
-            out.write_record(["mono_ns", "direction", "bytes", "delay_s"])?;
-            Some(out)
-        }
-    };
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()?;
-    let (mut passed, mut lost) = (0u64, 0u64);
-    let result = runtime.block_on(async {
-        let (quit, _words) = shell::listen(false, "quit", || {})?;
-        let config = RelayConfig {
-            listen: args.listen,
-            to: args.to,
-            up: args.shape.config(),
-            down: args.shape.config(),
-            seed: args.shape.link_seed,
-        };
-        let relay = Relay::bind(config, HostClock::new())
-            .await
-            .with_context(|| {
-                format!(
-                    "cannot listen on {}: choose another --listen, or stop what uses it",
-                    args.listen
-                )
-            })?;
-        say!(
-            "relaying {} to {}; Ctrl-C ends it",
-            relay.local_addr()?,
-            args.to
-        );
-        let mut trouble = None;
-        relay
-            .run(quit, |passage: Passage| {
-                *(if passage.out.is_some() {
-                    &mut passed
-                } else {
-                    &mut lost
-                }) += 1;
-                if let Some(out) = &mut record {
-                    let delay_s = passage
-                        .out
-                        .map_or(String::new(), |t| t.secs_since(passage.at).to_string());
-                    let direction = if passage.up { "up" } else { "down" };
-                    let row = [
-                        &passage.at.0.to_string(),
-                        direction,
-                        &passage.len_bytes.to_string(),
-                        &delay_s,
-                    ];
-                    trouble = trouble.take().or(out.write_record(row).err());
-                }
-            })
-            .await;
-        trouble.map_or(Ok(()), |e| Err(anyhow::Error::from(e)))
-    });
-    say!("{passed} packets passed, {lost} lost");
-    if let Some(mut out) = record {
-        out.flush()?;
-    }
-    result
 }

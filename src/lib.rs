@@ -15,6 +15,7 @@ mod evaluate;
 mod figure;
 pub mod ground;
 mod ingest;
+mod link;
 pub mod measure;
 mod paper;
 mod picture;

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use telemime_endpoint::cli::told;
 use telemime_endpoint::meter::IP_UDP_HEADER;
 use telemime_endpoint::{HostClock, Mono};
-use telemime_sim::link::{Fate, Link, LinkConfig};
+use telemime_sim::link::{Damage, Link, LinkConfig, Outcome};
 use tokio::net::UdpSocket;
 use tokio::sync::{mpsc, watch};
 use tokio::time::sleep_until;
@@ -47,8 +47,61 @@ pub struct Passage {
     pub up: bool,
     /// Length, IP and UDP headers included, bytes.
     pub len_bytes: usize,
-    /// When it went out again; `None` if it was lost.
+    /// When it went out again; `None` if it did not.
     pub out: Option<Mono>,
+    /// Why, or how.
+    pub fate: Fate,
+    /// It is the duplicate of another.
+    pub copy: bool,
+}
+
+/// How a packet got through, or why it did not.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fate {
+    /// As it was.
+    Passed,
+    /// At once, before those that waited.
+    Overtook,
+    /// With one bit flipped.
+    Corrupted,
+    /// Not at all: the flipped bit lay in its headers, whose checksums tell.
+    Garbled,
+    /// Lost.
+    Lost,
+    /// The queue was full.
+    Overflow,
+    /// The link was out.
+    Outage,
+    /// The system did not take it, or its client has gone.
+    Refused,
+}
+
+impl Fate {
+    /// All there are.
+    pub const ALL: [Self; 8] = [
+        Self::Passed,
+        Self::Overtook,
+        Self::Corrupted,
+        Self::Garbled,
+        Self::Lost,
+        Self::Overflow,
+        Self::Outage,
+        Self::Refused,
+    ];
+
+    /// In a word, as the record has it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Passed => "passed",
+            Self::Overtook => "overtook",
+            Self::Corrupted => "corrupted",
+            Self::Garbled => "garbled",
+            Self::Lost => "lost",
+            Self::Overflow => "overflow",
+            Self::Outage => "outage",
+            Self::Refused => "refused",
+        }
+    }
 }
 
 /// A bound relay.
@@ -65,6 +118,8 @@ struct Packet {
     client: SocketAddr,
     at: Mono,
     bytes: Vec<u8>,
+    fate: Fate,
+    copy: bool,
 }
 
 struct Client {
@@ -105,11 +160,10 @@ impl Relay {
 
     /// Passes packets on until `quit` turns true. `passages` hears of every packet once its fate is done.
     pub async fn run(mut self, mut quit: watch::Receiver<bool>, mut passages: impl FnMut(Passage)) {
-        let mut up = Link::new(self.config.up.clone(), self.config.seed);
-        let mut down = Link::new(
-            self.config.down.clone(),
-            self.config.seed ^ 0x9e37_79b9_7f4a_7c15,
-        );
+        let began = self.clock.now().0;
+        let mut up = Link::new(self.config.up.clone(), self.config.seed).beginning_at(began);
+        let seed_down = self.config.seed ^ 0x9e37_79b9_7f4a_7c15;
+        let mut down = Link::new(self.config.down.clone(), seed_down).beginning_at(began);
         let mut clients: BTreeMap<SocketAddr, Client> = BTreeMap::new();
         let (tx, mut from_far) = mpsc::channel::<(SocketAddr, Vec<u8>)>(READ_AHEAD);
         // Packets on their way: by time of delivery, then by order of arrival.
@@ -121,14 +175,14 @@ impl Relay {
             let next = due
                 .peek()
                 .map(|Reverse((at, _))| self.clock.instant(Mono(*at)));
-            let packet = tokio::select! {
+            let (is_up, client, at, bytes) = tokio::select! {
                 biased;
                 () = told(&mut quit) => break,
                 Ok(()) = self.shapes.changed() => {
                     let shape = self.shapes.borrow_and_update().clone();
                     if let Some(shape) = shape {
-                        up.reshape(shape.clone());
-                        down.reshape(shape);
+                        up = Link::new(shape.clone(), self.config.seed).beginning_at(began);
+                        down = Link::new(shape, seed_down).beginning_at(began);
                     }
                     continue;
                 }
@@ -138,7 +192,7 @@ impl Relay {
                         due.pop();
                         let Some(packet) = flying.remove(&id) else { continue };
                         let sent = self.deliver(&packet, &clients).await;
-                        passages(passage(&packet, sent.then_some(now)));
+                        passages(passage(&packet, if sent { packet.fate } else { Fate::Refused }, sent.then_some(now)));
                     }
                     continue;
                 }
@@ -148,23 +202,40 @@ impl Relay {
                         if !self.know(client, at, &mut clients, &tx).await {
                             continue;
                         }
-                        Packet { up: true, client, at, bytes: buffer[..len].to_vec() }
+                        (true, client, at, buffer[..len].to_vec())
                     }
                     // An ICMP error of an earlier packet: the link goes on.
                     Err(_) => continue,
                 },
-                Some((client, bytes)) = from_far.recv() => {
-                    Packet { up: false, client, at: self.clock.now(), bytes }
-                }
+                Some((client, bytes)) = from_far.recv() => (false, client, self.clock.now(), bytes),
             };
-            let link = if packet.up { &mut up } else { &mut down };
-            match link.send(packet.at.0, packet.bytes.len() + IP_UDP_HEADER as usize) {
-                Fate::Deliver { at_ns } => {
-                    count += 1;
-                    due.push(Reverse((at_ns, count)));
-                    flying.insert(count, packet);
+            let link = if is_up { &mut up } else { &mut down };
+            let fate = link.send(at.0, bytes.len() + IP_UDP_HEADER as usize);
+            let copies = [
+                fate.duplicate.map(|o| (o, true)),
+                Some((fate.packet, false)),
+            ];
+            let mut bytes = Some(bytes);
+            for (outcome, copy) in copies.into_iter().flatten() {
+                let bytes = if copy { bytes.clone() } else { bytes.take() };
+                let mut packet = Packet {
+                    up: is_up,
+                    client,
+                    at,
+                    bytes: bytes.unwrap_or_default(),
+                    fate: Fate::Passed,
+                    copy,
+                };
+                let (fate, at_ns) = arrival(outcome, &mut packet.bytes);
+                packet.fate = fate;
+                match at_ns {
+                    Some(at_ns) => {
+                        count += 1;
+                        due.push(Reverse((at_ns, count)));
+                        flying.insert(count, packet);
+                    }
+                    None => passages(passage(&packet, fate, None)),
                 }
-                Fate::Lost | Fate::Overflow => passages(passage(&packet, None)),
             }
         }
         clients.values().for_each(|client| client.reader.abort());
@@ -242,11 +313,30 @@ async fn read(far: Arc<UdpSocket>, client: SocketAddr, tx: mpsc::Sender<(SocketA
     }
 }
 
-fn passage(packet: &Packet, out: Option<Mono>) -> Passage {
+/// What becomes of one copy, which is damaged here if it is to be, and when it arrives, ns.
+fn arrival(outcome: Outcome, bytes: &mut [u8]) -> (Fate, Option<i64>) {
+    let delivery = match outcome {
+        Outcome::Lost => return (Fate::Lost, None),
+        Outcome::Overflow => return (Fate::Overflow, None),
+        Outcome::Outage => return (Fate::Outage, None),
+        Outcome::Deliver(delivery) => delivery,
+    };
+    let struck = |damage: Damage| damage.strike(bytes, IP_UDP_HEADER as usize);
+    match delivery.damage.map(struck) {
+        Some(false) => (Fate::Garbled, None),
+        Some(true) => (Fate::Corrupted, Some(delivery.at_ns)),
+        None if delivery.at_once => (Fate::Overtook, Some(delivery.at_ns)),
+        None => (Fate::Passed, Some(delivery.at_ns)),
+    }
+}
+
+fn passage(packet: &Packet, fate: Fate, out: Option<Mono>) -> Passage {
     Passage {
         at: packet.at,
         up: packet.up,
         len_bytes: packet.bytes.len() + IP_UDP_HEADER as usize,
         out,
+        fate,
+        copy: packet.copy,
     }
 }

@@ -222,12 +222,7 @@ pub(super) fn mirror(
     };
     let plane = widest(&verdict.truth);
     let skill = load_skill(run)?;
-    let link = format!(
-        "{:.0} ± {:.0} ms and {:.1} % loss each way",
-        args.link.delay * 1e3,
-        args.link.jitter * 1e3,
-        args.link.loss * 1e2
-    );
+    let link = args.link.describe();
     let figure = Figure {
         title: format!(
             "The tip is {:.0} mm off the hand; without prediction it is {:.0} mm",

@@ -17,6 +17,7 @@ use super::{Args, Material};
 use crate::measure::{
     Hand, Track, Turns, follow, is_edge, rms, rmse_m, sample_and_hold, smooth_jerk_m_s3,
 };
+use crate::relay::Fate;
 
 /// One way of following the hand.
 pub(super) struct Way {
@@ -333,11 +334,14 @@ fn raw_arrivals(run: &Run, truth: &Track, zero_ns: i64) -> Vec<(f64, f64, f64)> 
     let mut up: Vec<_> = run
         .passages
         .iter()
-        .filter(|p| p.up)
+        .filter(|p| p.up && !p.copy)
         .map(|p| {
             (
                 (p.at.0 - zero_ns) as f64 * 1e-9,
-                p.out.map(|out| out.secs_since(p.at)),
+                // What arrives with a bit flipped is as good as lost.
+                p.out
+                    .filter(|_| p.fate != Fate::Corrupted)
+                    .map(|out| out.secs_since(p.at)),
             )
         })
         .collect();

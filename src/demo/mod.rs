@@ -19,7 +19,7 @@ use telemime_operator::demonstration::{Demonstration, Demonstrations, Sample};
 use telemime_sim::hand::swing_with_wrist;
 use telemime_sim::link::parse_duration_s;
 
-use crate::cli::Shape;
+use crate::cli::Ways;
 
 /// Performances the demo learns from; one more is driven.
 const PERFORMANCES: u32 = 5;
@@ -80,7 +80,7 @@ pub(crate) struct Args {
     #[arg(long, conflicts_with = "demos")]
     wrist: bool,
     #[command(flatten)]
-    link: Shape,
+    link: Ways,
     /// Where figures and logs go.
     #[arg(long, value_name = "DIR", default_value = "runs/demo")]
     out: PathBuf,

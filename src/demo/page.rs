@@ -7,7 +7,7 @@ use anyhow::{Context, bail};
 use telemime_endpoint::HostClock;
 use telemime_operator::cli::Event as Operator;
 use telemime_operator::console::Shape;
-use telemime_sim::link::LinkConfig;
+use telemime_sim::link::{LinkConfig, Loss};
 use tokio::sync::watch;
 
 use super::Args;
@@ -29,13 +29,13 @@ async fn serve(args: &Args, page: SocketAddr, scratch: &Path) -> anyhow::Result<
         addr,
         operator_args: who,
     } = start_robot(args, scratch, None).await?;
-    let link = args.link.config();
+    let link = args.link.shape.config();
     let config = RelayConfig {
         listen: SocketAddr::from(([127, 0, 0, 1], 0)),
         to: addr,
-        up: link.clone(),
-        down: link.clone(),
-        seed: args.link.link_seed,
+        up: args.link.up(),
+        down: args.link.down(),
+        seed: args.link.shape.link_seed,
     };
     let (shapes, shapes_rx) = watch::channel(None);
     let relay = Relay::bind(config, HostClock::new())
@@ -50,9 +50,9 @@ async fn serve(args: &Args, page: SocketAddr, scratch: &Path) -> anyhow::Result<
     operator_args.extend(who);
     let now = format!(
         "{},{},{}",
-        link.delay_s * 1e3,
-        link.jitter_s * 1e3,
-        link.loss * 1e2
+        args.link.shape.delay * 1e3,
+        args.link.shape.jitter * 1e3,
+        args.link.shape.loss * 1e2
     );
     operator_args.extend(["--console".to_owned(), page.to_string()]);
     operator_args.extend(["--console-link".to_owned(), now]);
@@ -80,7 +80,7 @@ fn shaped(link: &LinkConfig, shape: Shape) -> LinkConfig {
     LinkConfig {
         delay_s: shape.delay_ms * 1e-3,
         jitter_s: shape.jitter_ms * 1e-3,
-        loss: shape.loss_percent * 1e-2,
+        loss: Loss::random(shape.loss_percent * 1e-2),
         ..link.clone()
     }
 }

@@ -166,9 +166,9 @@ pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> any
     let config = RelayConfig {
         listen: SocketAddr::from(([127, 0, 0, 1], 0)),
         to: addr,
-        up: args.link.config(),
-        down: args.link.config(),
-        seed: args.link.link_seed,
+        up: args.link.up(),
+        down: args.link.down(),
+        seed: args.link.shape.link_seed,
     };
     let relay = Relay::bind(config, clock)
         .await

@@ -6,6 +6,7 @@ use anyhow::Context;
 use serde::Serialize;
 use telemime_operator::cli::Event as Operator;
 use telemime_robot::cli::Event as Robot;
+use telemime_sim::link::LinkConfig;
 
 use super::judge::Verdict;
 use super::processes::Run;
@@ -49,7 +50,12 @@ struct Result {
     path_samples: usize,
     link_delay_ms: f64,
     link_jitter_ms: f64,
-    link_loss: f64,
+    /// Null where losses are correlated in netem's way.
+    link_loss: Option<f64>,
+    link_up: LinkConfig,
+    link_down: LinkConfig,
+    #[serde(skip)]
+    link: String,
     clock_bound_ms: Option<f64>,
     judged_s: f64,
     tick_mean_us: f64,
@@ -205,9 +211,12 @@ fn gather(
         path_bound_m: path_bound_m.context("the operator never said how it maps")?,
         path_error_m: verdict.path_error_m,
         path_samples: verdict.path_samples,
-        link_delay_ms: args.link.delay * 1e3,
-        link_jitter_ms: args.link.jitter * 1e3,
-        link_loss: args.link.loss,
+        link_delay_ms: args.link.up().delay_s * 1e3,
+        link_jitter_ms: args.link.up().jitter_s * 1e3,
+        link_loss: args.link.up().loss.share(),
+        link_up: args.link.up(),
+        link_down: args.link.down(),
+        link: args.link.describe(),
         clock_bound_ms,
         judged_s: verdict.grid_s.len() as f64 * 1e-3,
         tick_mean_us,
@@ -238,7 +247,7 @@ fn table(r: &Result) -> String {
         format!(", session clock known to ±{ms:.0} ms")
     });
     format!(
-        "\n{}\n{} at scale {:.3}; {:.0} ± {:.0} ms and {:.1} % loss each way; judged over {:.1} s\n\n\
+        "\n{}\n{} at scale {:.3}; {}; judged over {:.1} s\n\n\
          hand against tip, in hand metres      RMS error    lag\n\
          as sent, delayed, ideal tip          {}   {}\n\
          as sent, delayed, through the arm    {}   {}\n\
@@ -252,9 +261,7 @@ fn table(r: &Result) -> String {
         r.what,
         r.arm,
         r.scale,
-        r.link_delay_ms,
-        r.link_jitter_ms,
-        r.link_loss * 1e2,
+        r.link,
         r.judged_s,
         mm(r.rmse_delayed_m),
         ms(r.lag_delayed_ms),

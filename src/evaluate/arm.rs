@@ -8,7 +8,7 @@ use telemime_operator::task::{Outcome, Recording, Task};
 use telemime_protocol::skill::Skill;
 use telemime_robot::rig::Rig;
 use telemime_robot::servo::{Mapping, RAMP_S, Report};
-use telemime_sim::link::{Fate, Link, LinkConfig};
+use telemime_sim::link::{Link, LinkConfig};
 
 use crate::ground::{Pair, PairError, run_virtual};
 use crate::measure::{
@@ -153,9 +153,9 @@ fn judge(
     let arrivals: Vec<_> = truth
         .points()
         .iter()
-        .filter_map(|(t_s, x)| match link.send((t_s * 1e9) as i64, RAW_BYTES) {
-            Fate::Deliver { at_ns } => Some((at_ns as f64 * 1e-9, *t_s, *x)),
-            Fate::Lost | Fate::Overflow => None,
+        .filter_map(|(t_s, x)| {
+            let at_ns = link.send((t_s * 1e9) as i64, RAW_BYTES).arrival_ns()?;
+            Some((at_ns as f64 * 1e-9, *t_s, *x))
         })
         .collect();
     let start = truth.points()[0].1;

@@ -8,7 +8,7 @@ use telemime_operator::session::{FutureBound, SessionConfig};
 use telemime_protocol::predict::{Forecast, HandState};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
-use telemime_sim::link::{Fate, Link, LinkConfig};
+use telemime_sim::link::{Link, LinkConfig};
 
 use super::live::{Live, Said, on_session_clock};
 
@@ -168,7 +168,7 @@ fn by_rule(
         let told = Told::Straight(t, s.position, hand.motion().0 * factor);
         sent = Some(told);
         outcome.messages += 1;
-        if let Fate::Deliver { at_ns } = wire.send(ns(s.t_s), HEADERS) {
+        if let Some(at_ns) = wire.send(ns(s.t_s), HEADERS).arrival_ns() {
             let at_s = at_ns as f64 * 1e-9;
             arrivals.push(Arrival { at_s, told });
         }
@@ -228,7 +228,7 @@ fn send(
         let bytes = HEADERS + said.bytes;
         outcome.messages += 1;
         outcome.bytes += bytes;
-        if let Fate::Deliver { at_ns } = wire.send(ns(said.at_s), bytes) {
+        if let Some(at_ns) = wire.send(ns(said.at_s), bytes).arrival_ns() {
             let at_s = at_ns as f64 * 1e-9;
             news.push((at_s, News::Arrival(said.knots)));
             arrivals.push(Arrival {
@@ -247,6 +247,7 @@ fn ns(t_s: f64) -> i64 {
 mod tests {
     use telemime_operator::demonstration::Sample;
     use telemime_operator::learn::{LearnOptions, learn_skill};
+    use telemime_sim::link::Loss;
 
     use super::*;
 
@@ -269,7 +270,7 @@ mod tests {
     fn slow(loss: f64) -> LinkConfig {
         LinkConfig {
             delay_s: 0.1,
-            loss,
+            loss: Loss::random(loss),
             ..LinkConfig::default()
         }
     }

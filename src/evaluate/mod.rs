@@ -118,7 +118,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let sets = read(&args.dirs, args.matching.as_deref())?;
     let off_model = read(&args.off_model, None)?;
     let link = args.link.config();
-    if link.rate_bit_s.is_some() {
+    if link.rate.is_some() {
         bail!("--rate: the study's link has no bottleneck; telemime demo shows one");
     }
     let schemes = schemes(&sets, link.delay_s);

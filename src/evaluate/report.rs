@@ -533,7 +533,11 @@ fn dual(plan: &Plan<'_>, performances: &[Performance]) -> Dual {
     Dual {
         delay_ms: ms(plan.link.delay_s),
         jitter_ms: ms(plan.link.jitter_s),
-        loss: plan.link.loss,
+        loss: plan
+            .link
+            .loss
+            .share()
+            .expect("the study's losses are independent"),
         hold_rmse_mm: hold_m.map(|m| m * 1e3),
         rows: plan.schemes.iter().zip(&sums).map(row).collect(),
     }

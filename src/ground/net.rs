@@ -85,11 +85,12 @@ impl Network {
         self.state().inboxes.remove(&addr);
     }
 
-    /// Sets the link from `from` to `to`.
+    /// Sets the link from `from` to `to`, which begins now: its outages and traces count from here.
     pub fn link(&self, from: SocketAddr, to: SocketAddr, config: LinkConfig, seed: u64) {
-        self.state()
-            .links
-            .insert((from, to), Link::new(config, seed));
+        let mut state = self.state();
+        let now_ns = state.epoch.elapsed().as_nanos() as i64;
+        let link = Link::new(config, seed).beginning_at(now_ns);
+        state.links.insert((from, to), link);
     }
 
     /// Cuts every link, or restores them. Packets already on their way arrive.
@@ -128,21 +129,26 @@ impl Network {
         let len = packet.len() + IP_UDP_HEADER as usize;
         let fate = match state.links.get_mut(&(from, to)) {
             Some(link) => link.send(now_ns, len),
-            None => Fate::Deliver { at_ns: now_ns },
-        };
-        let Fate::Deliver { at_ns } = fate else {
-            return;
+            None => Fate::whole(now_ns),
         };
         if state.down {
             return;
         }
-        let at = state.epoch + Duration::from_nanos(at_ns.max(0) as u64);
+        let epoch = state.epoch;
         drop(state);
-        let (network, packet) = (self.clone(), packet.to_vec());
-        tokio::spawn(async move {
-            sleep_until(at).await;
-            network.deliver(from, to, packet);
-        });
+        for delivery in fate.deliveries() {
+            let (network, mut packet) = (self.clone(), packet.to_vec());
+            if let Some(damage) = delivery.damage
+                && !damage.strike(&mut packet, IP_UDP_HEADER as usize)
+            {
+                continue;
+            }
+            let at = epoch + Duration::from_nanos(delivery.at_ns.max(0) as u64);
+            tokio::spawn(async move {
+                sleep_until(at).await;
+                network.deliver(from, to, packet);
+            });
+        }
     }
 
     fn deliver(&self, from: SocketAddr, to: SocketAddr, packet: Vec<u8>) {

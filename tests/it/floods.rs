@@ -17,7 +17,7 @@ use telemime_protocol::wire::hello::{Answer, Hello};
 use telemime_protocol::wire::v1::{Message, OperatorControl, RobotState, VERSION};
 use telemime_robot::daemon::Notice as RobotNotice;
 use telemime_robot::door;
-use telemime_sim::link::LinkConfig;
+use telemime_sim::link::{LinkConfig, Loss};
 use tokio::time::timeout;
 
 use crate::scene::{delayed, finish, mirroring, rig, shaped};
@@ -41,7 +41,7 @@ fn deaf_strangers(pair: &mut Pair, count: u8) {
         let endpoint = pair.stranger(&delayed(0.02), u64::from(n)).unwrap();
         let own = endpoint.local_addr().unwrap();
         let silence = LinkConfig {
-            loss: 1.0,
+            loss: Loss::random(1.0),
             ..LinkConfig::default()
         };
         pair.network.link(pair.robot_addr(), own, silence, 0);

@@ -18,6 +18,7 @@ mod horizon;
 mod ingest;
 mod interop;
 mod layout;
+mod link;
 mod mirror;
 mod pairing;
 mod paper;

@@ -9,7 +9,7 @@ use telemime_protocol::spline::HermiteSpan;
 use telemime_robot::daemon::Notice as RobotNotice;
 use telemime_robot::rig::Rig;
 use telemime_robot::servo::Report;
-use telemime_sim::link::{Fate, Link};
+use telemime_sim::link::Link;
 
 use crate::scene::{finish, mirroring, rig, shaped, unseen};
 
@@ -85,9 +85,9 @@ fn the_tip_moves_with_the_hand() {
     let arrivals: Vec<_> = hand
         .points()
         .iter()
-        .filter_map(|(t_s, x)| match link.send((t_s * 1e9) as i64, 44) {
-            Fate::Deliver { at_ns } => Some((at_ns as f64 * 1e-9, *t_s, *x)),
-            Fate::Lost | Fate::Overflow => None,
+        .filter_map(|(t_s, x)| {
+            let at_ns = link.send((t_s * 1e9) as i64, 44).arrival_ns()?;
+            Some((at_ns as f64 * 1e-9, *t_s, *x))
         })
         .collect();
     let from_s = tip.span_s().0;

@@ -15,7 +15,7 @@ use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_robot::clock::Origin;
 use telemime_robot::daemon::Notice as RobotNotice;
 use telemime_robot::servo::Report;
-use telemime_sim::link::LinkConfig;
+use telemime_sim::link::{LinkConfig, Loss, Rate};
 
 use crate::scene::{Samples, delayed, replay, rig, skill};
 
@@ -157,7 +157,7 @@ fn a_link_that_is_dead_one_way_only_is_back_as_soon() {
                 let (ours, robot) = (operator.addr, pair.robot_addr());
                 let (from, to) = if up { (ours, robot) } else { (robot, ours) };
                 let dead = LinkConfig {
-                    loss: 1.0,
+                    loss: Loss::random(1.0),
                     ..link.clone()
                 };
                 pair.network.link(from, to, dead, seed);
@@ -186,7 +186,7 @@ fn a_link_that_is_dead_one_way_only_is_back_as_soon() {
 fn a_thin_link_is_not_drowned_by_attempts() {
     run_virtual(async {
         let thin = LinkConfig {
-            rate_bit_s: Some(64e3),
+            rate: Some(Rate::bits(64_000)),
             ..delayed(0.05)
         };
         let mut pair = Pair::start(&rig()).unwrap();

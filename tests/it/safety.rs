@@ -10,6 +10,7 @@ use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_robot::daemon::Notice as RobotNotice;
 use telemime_robot::rig::Rig;
 use telemime_robot::servo::Report;
+use telemime_sim::link::Loss;
 
 use crate::scene::{delayed, finish, mirroring, rig, shaped, skill, speed};
 
@@ -256,7 +257,7 @@ fn a_stop_gets_through_a_link_that_loses_most() {
         let operator = mirroring(&mut pair, &delayed(0.1), 25);
         let pressed = full_speed(&pair).await;
         let mut bad = delayed(0.1);
-        bad.loss = 0.6;
+        bad.loss = Loss::random(0.6);
         pair.set_link(1, &bad, 26);
         operator.say(Word::Stop);
         pair.run_for(0.6).await;

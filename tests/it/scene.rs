@@ -12,7 +12,7 @@ use telemime_protocol::skill::Skill;
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo::Report;
 use telemime_sim::hand::swing;
-use telemime_sim::link::LinkConfig;
+use telemime_sim::link::{LinkConfig, Loss};
 
 const PERSON: u64 = 3;
 
@@ -26,7 +26,7 @@ pub(crate) fn shaped() -> LinkConfig {
     LinkConfig {
         delay_s: 0.1,
         jitter_s: 0.01,
-        loss: 0.01,
+        loss: Loss::random(0.01),
         ..LinkConfig::default()
     }
 }

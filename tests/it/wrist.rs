@@ -14,7 +14,7 @@ use telemime_protocol::skill::Skill;
 use telemime_protocol::wire::v1::RobotState;
 use telemime_robot::servo::{RAMP_S, Report};
 use telemime_sim::hand::swing_with_wrist;
-use telemime_sim::link::{Fate, Link};
+use telemime_sim::link::Link;
 
 use crate::scene::{REST_S, finish, rig, shaped};
 
@@ -99,9 +99,9 @@ fn a_turning_hand_is_mirrored_ahead_of_its_link() {
     let mut link = Link::new(shaped(), 11);
     let arrivals: Vec<_> = samples
         .iter()
-        .filter_map(|s| match link.send((s.t_s * 1e9) as i64, 60) {
-            Fate::Deliver { at_ns } => Some((at_ns as f64 * 1e-9, s.t_s, s.t_s)),
-            Fate::Lost | Fate::Overflow => None,
+        .filter_map(|s| {
+            let at_ns = link.send((s.t_s * 1e9) as i64, 60).arrival_ns()?;
+            Some((at_ns as f64 * 1e-9, s.t_s, s.t_s))
         })
         .collect();
     let seen = |t_s: f64| Hand {
