@@ -357,7 +357,9 @@ impl Daemon {
         let mut dialler = Dialler::new(&self.endpoint, addr, self.config.versions, seen);
         let mut said = None;
         loop {
-            let outcome = console.beside(|| self.now(), task, stop, dialler.next()).await;
+            let outcome = console
+                .beside(|| self.now(), task, stop, dialler.next())
+                .await;
             let patient = self.now().secs_since(begun) <= self.patience.as_secs_f64();
             let why = match outcome {
                 Some(Ok(link)) => return Ok(Some(link)),

@@ -7,8 +7,8 @@ use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
 use tokio::task::JoinHandle;
 
-use crate::demonstration::{Demonstration, DemonstrationError, Sample};
 use crate::cli::{Bounds, infer};
+use crate::demonstration::{Demonstration, DemonstrationError, Sample};
 use crate::learn::{LearnError, LearnOptions, Refinement, learn_skill, refine};
 use crate::recognise::{RecogniseOptions, Recogniser};
 use crate::session::HandSample;

@@ -6,8 +6,8 @@ use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, Refusal, RobotState};
 
-use crate::demonstration::Sample;
 use crate::console::Live;
+use crate::demonstration::Sample;
 use crate::session::{Event, HandSample, LOST_S, Leeway, Session};
 
 /// Pause before a declined request is made again, s.

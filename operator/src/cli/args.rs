@@ -395,9 +395,7 @@ impl Args {
             min_interval_s: self.min_interval.unwrap_or(defaults.min_interval_s),
             lease_s: self.lease.unwrap_or(defaults.lease_s),
             future_bound: self.future_bound.unwrap_or(defaults.future_bound),
-            path_bound_m: self
-                .path_bound
-                .or(page.then_some(CONSOLE_PATH_BOUND_M)),
+            path_bound_m: self.path_bound.or(page.then_some(CONSOLE_PATH_BOUND_M)),
             input_latency_s: self.input_latency.unwrap_or(0.0),
             glitch_gate: self.glitch_gate,
             gain: self.gain.unwrap_or(defaults.gain),

@@ -12,9 +12,9 @@ mod hand;
 mod hear;
 mod mirror;
 mod said;
-mod view;
 #[cfg(test)]
 mod tests;
+mod view;
 
 use std::collections::VecDeque;
 use std::sync::Arc;

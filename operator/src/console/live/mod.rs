@@ -129,7 +129,7 @@ pub fn seat(
     let (commands, said) = mpsc::channel(COMMANDS);
     let (shown, snapshots) = watch::channel(Arc::default());
     let using = known.first().map(|known| known.skill.name().to_owned());
-    let live = Live {
+    let mut live = Live {
         said,
         shown,
         rotation,
@@ -155,6 +155,7 @@ pub fn seat(
         noted: 0,
         next: Stamp(i64::MIN),
     };
+    live.publish(None, Stamp::ZERO);
     (
         live,
         Port {
@@ -195,6 +196,7 @@ impl Live {
             said,
             Said::Command(Command::Hand { .. } | Command::Alive {})
         );
+        let linked = session.is_some();
         let done = match said {
             Said::Here => Ok(None),
             Said::Gone => {
@@ -210,13 +212,17 @@ impl Live {
         if !moves {
             self.next = now;
         }
-        done.unwrap_or_else(|why| {
+        let act = done.unwrap_or_else(|why| {
             self.refused += 1;
             if self.notes.back().is_none_or(|(_, last)| *last != why) {
                 self.note(why);
             }
             None
-        })
+        });
+        if !linked {
+            self.publish(None, now);
+        }
+        act
     }
 
     fn obey(

@@ -40,6 +40,7 @@ export class Drive extends EventTarget {
     if (this.what || !this.link.open || !tip) return false;
     this.what = what === "hand" && this.recording ? "record" : what;
     this.granted = false;
+    this.begun = performance.now();
     this.p = tip;
     this.link.say({ do: "hold", what: this.what, skill, t: performance.now(), x: this.p });
     this.changed();
@@ -71,6 +72,8 @@ export class Drive extends EventTarget {
     // Whoever let go at the other end, the clutch must be pressed anew.
     if (this.granted && you !== true) this.lost();
     this.granted ||= you === true;
+    // Refused: the log says why.
+    if (!this.granted && performance.now() - this.begun > 1500) this.lost();
   }
 
   changed() {

@@ -16,6 +16,7 @@ export class Panel {
     this.noted = -1;
     this.choices = "";
     this.dragged = null;
+    this.switched = 0;
     this.buttons();
     this.sliders();
     this.measuring();
@@ -30,7 +31,10 @@ export class Panel {
     drive.button($("play"), () => drive.begin("play", $("skills").value));
     $("stop").addEventListener("click", () => drive.stop());
     $("reset").addEventListener("click", () => link.say({ do: "reset" }));
-    $("predict").addEventListener("change", (event) => link.say({ do: "predict", gain: event.target.checked ? 1 : 0 }));
+    $("predict").addEventListener("change", (event) => {
+      this.switched = performance.now();
+      link.say({ do: "predict", gain: event.target.checked ? 1 : 0 });
+    });
     $("record").addEventListener("change", (event) => {
       drive.end();
       drive.recording = event.target.checked;
@@ -121,7 +125,8 @@ export class Panel {
     $("reset").hidden = state !== "Stopped";
     $("hold").disabled = $("play").disabled = !state || state === "Stopped" || now.you === false;
     $("play").disabled ||= !now.skills.length;
-    if (document.activeElement !== $("predict") || $("predict").checked !== now.gain > 0) $("predict").checked = now.gain > 0;
+    // What was just switched is not switched back by what was said before.
+    if (performance.now() - this.switched > 500) $("predict").checked = now.gain > 0;
     this.teaching(now);
     this.shape(now.shape);
     for (const [id, text] of now.notes) {
