@@ -29,7 +29,7 @@ function demo() {
 
 class Person {
   static async at(browser, url, options = {}) {
-    const page = await browser.newPage({ viewport: { width: 1180, height: 760 }, ...options });
+    const page = await browser.newPage({ viewport: { width: 1000, height: 680 }, ...options });
     const person = new Person();
     person.page = page;
     person.wrong = [];
@@ -53,6 +53,11 @@ class Person {
   }
 
   async picture(name) {
+    // In full, however slow this machine is.
+    await this.page.evaluate(async () => {
+      Object.assign(telemime.scene ?? {}, { quality: 1, pace: 16, next: 0 });
+      await new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)));
+    });
     await this.page.screenshot({ path: join(shots, `${name}.png`) });
   }
 
@@ -160,6 +165,7 @@ async function main(browser, url) {
   await person.state("Ready");
 
   step("the skill is played as long as its button is held");
+  await page.locator("#play").scrollIntoViewIfNeeded();
   const button = await page.locator("#play").boundingBox();
   await page.mouse.move(button.x + 8, button.y + 8);
   await page.mouse.down();
@@ -223,7 +229,13 @@ async function main(browser, url) {
   const args = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"];
   const browser = await chromium.launch({ executablePath, args });
   try {
-    await main(browser, await url);
+    await main(browser, await url).catch(async (error) => {
+      for (const page of browser.contexts().flatMap((context) => context.pages())) {
+        console.error(await page.evaluate(() => JSON.stringify({ ...globalThis.telemime?.link.now, path: undefined, knots: undefined })));
+        await page.screenshot({ path: join(shots, "failed.png") });
+      }
+      throw error;
+    });
     console.log("the page does what it says");
   } finally {
     await browser.close();

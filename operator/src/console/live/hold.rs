@@ -74,7 +74,7 @@ impl Live {
             Some(_) => self.let_go(Some(session)),
             None => {}
         }
-        if what != Holding::Record && !session.is_ready() {
+        if what == Holding::Play && !session.is_ready() {
             return Err("the robot is not ready yet: it is still told of the skill".into());
         }
         if what != Holding::Record && session.state() == RobotState::Stopped {
@@ -128,8 +128,13 @@ impl Live {
 
     pub(super) fn ask(&mut self, now: Stamp, session: &mut Session) {
         if let Some(hold) = &mut self.hold {
-            hold.phase = Phase::Asked;
             hold.tries += 1;
+            // A skill that was just learned is still on its way.
+            if !session.is_ready() && hold.tries < RETRIES {
+                hold.phase = Phase::Again(now.offset_by_secs(RETRY_S));
+                return;
+            }
+            hold.phase = Phase::Asked;
             session.engage(now);
         }
     }

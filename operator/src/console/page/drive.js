@@ -123,8 +123,10 @@ export class Drive extends EventTarget {
     const { canvas, pointers } = this;
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
-      pointers.set(event.pointerId, [event.clientX, event.clientY]);
-      if (pointers.size === 1 && event.button === 0 && this.near(event) && this.begin("hand")) {
+      // A pointer that took hold of the hand never turns the picture, even when the hand is let go for it.
+      const hand = pointers.size === 0 && event.button === 0 && this.near(event);
+      pointers.set(event.pointerId, [event.clientX, event.clientY, hand]);
+      if (hand && this.begin("hand")) {
         this.grabbed = event.pointerId;
         canvas.classList.add("driving");
       }
@@ -133,10 +135,11 @@ export class Drive extends EventTarget {
       const before = pointers.get(event.pointerId);
       if (!before) return canvas.classList.toggle("near", this.near(event));
       const [dx, dy] = [event.clientX - before[0], event.clientY - before[1]];
-      const others = [...pointers].filter(([id]) => id !== event.pointerId && id !== this.grabbed);
-      pointers.set(event.pointerId, [event.clientX, event.clientY]);
-      if (event.pointerId === this.grabbed) {
-        if (this.what) this.p = add(this.p, this.view.drag(this.p, dx, dy));
+      const others = [...pointers].filter(([id, [, , hand]]) => id !== event.pointerId && !hand);
+      const hand = before[2];
+      pointers.set(event.pointerId, [event.clientX, event.clientY, hand]);
+      if (hand) {
+        if (this.what && event.pointerId === this.grabbed) this.p = add(this.p, this.view.drag(this.p, dx, dy));
       } else if (others.length) {
         const [, [x, y]] = others[0];
         const apart = (p) => Math.hypot(p[0] - x, p[1] - y) || 1;

@@ -71,17 +71,14 @@ function measure(now) {
 // Beside the picture: whether the clutch is held does not depend on how fast the screen is.
 setInterval(() => drive.tick(performance.now()), 8);
 
-let previous = performance.now();
 function frame(time) {
-  scene?.paced(time - previous);
-  previous = time;
   const { now } = link;
   shown = smooth.at(performance.now()) ?? null;
   const held = drive.what === "hand" || drive.what === "record";
   // What the daemon made of the hand lies where the arm is to be; the hand of this very frame is fresher.
   const offset = now?.offset ?? [0, 0, 0];
   const place = held && drive.p ? drive.p.map((v, i) => v + (drive.what === "record" ? 0 : offset[i])) : tipShown();
-  if (scene) {
+  if (scene?.due(time)) {
     scene.draw({
       arm: link.arm, q: shown?.q, hand: now?.linked ? place : null, held,
       ghost: held && now?.arm && now.hand ? hand.at(now.t - now.arm.delay_ms) : null,
@@ -97,4 +94,4 @@ function frame(time) {
 requestAnimationFrame(frame);
 
 // For whoever tests the page.
-globalThis.telemime = { link, view, drive, fitts, tip: tipShown, hand: () => hand.all.at(-1)?.p ?? null, measured: () => measured };
+globalThis.telemime = { link, view, scene, drive, fitts, tip: tipShown, hand: () => hand.all.at(-1)?.p ?? null, measured: () => measured };

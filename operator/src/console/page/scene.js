@@ -23,7 +23,7 @@ export class Scene {
     this.view = view;
     this.renderer = new Renderer(canvas);
     this.quality = 1;
-    this.pace = 16;
+    Object.assign(this, { pace: 16, asked: performance.now(), next: 0 });
     const dark = matchMedia("(prefers-color-scheme: dark)");
     const choose = () => (this.colours = dark.matches ? DARK : LIGHT);
     dark.addEventListener("change", choose);
@@ -40,10 +40,19 @@ export class Scene {
     }
   }
 
-  /** A machine that cannot keep up gets a coarser picture, not a later one. */
-  paced(dt_ms) {
-    this.pace += 0.05 * (Math.min(200, dt_ms) - this.pace);
-    if (this.pace > 45 && this.quality > 0.4) [this.quality, this.pace] = [this.quality * 0.7, 16];
+  /**
+   * Whether to draw at `time`, ms. A machine that cannot keep up gets a coarser picture and fewer of them: what holds the
+   * clutch runs beside the drawing, and has half of the time.
+   */
+  due(time) {
+    if (time < this.next) return false;
+    // The frame after one that was drawn says how long that took.
+    const took = Math.min(200, time - this.asked);
+    this.pace += 0.1 * (took - this.pace);
+    if (this.pace > 45 && this.quality > 0.35) [this.quality, this.pace] = [this.quality * 0.7, 16];
+    this.next = took > 34 ? time + took : 0;
+    this.asked = this.next || time;
+    return true;
   }
 
   /** `what`: arm, q, hand, ghost, trail, path, knots, targets; whatever is missing is not drawn. */
