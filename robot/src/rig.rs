@@ -266,6 +266,10 @@ fn capsules(arm: &ArmModel) -> Vec<WireCapsule> {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::{Quaternion, Translation3, Unit, UnitQuaternion};
+    use telemime_protocol::wire::v1::{Message, RobotControl};
+    use telemime_sim::arm::Kinematics;
+
     use super::*;
 
     #[test]
@@ -278,6 +282,41 @@ mod tests {
         assert!(
             matches!(error, RigError::NoRoom { radius_m, .. } if radius_m < LEAST_RADIUS_M),
             "{error}"
+        );
+    }
+
+    /// As the document says it is to be read.
+    fn pose(at: &WirePlace) -> Isometry3<f64> {
+        let [w, x, y, z] = at.q.map(f64::from);
+        let [a, b, c] = at.m.map(f64::from);
+        let q = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+        Isometry3::from_parts(Translation3::new(a, b, c), q)
+    }
+
+    #[test]
+    fn what_is_described_has_its_tip_where_the_arm_has() {
+        let rig = Rig::load(&RigOptions::default()).unwrap();
+        let arm = rig.described();
+        let described = RobotControl::Arm(arm.clone());
+        let heard = RobotControl::decode(&described.encode());
+        assert_eq!(heard.as_ref(), Ok(&described));
+        for turned in [0.0, 0.3, -0.2] {
+            let q = rig.home.map(|q| q + turned);
+            let mut at = Isometry3::identity();
+            for (joint, q) in arm.joints.iter().zip(q.iter()) {
+                let axis = Unit::new_normalize(Vector3::from(joint.axis.map(f64::from)));
+                assert_eq!(joint.kind, WireJointKind::Revolute);
+                at = at * pose(&joint.place) * UnitQuaternion::from_axis_angle(&axis, *q);
+            }
+            at *= pose(&arm.tip);
+            let mut kinematics = Kinematics::new();
+            kinematics.update(&rig.arm, &q);
+            assert!((at.translation.vector - kinematics.tip()).norm() < 1e-5);
+        }
+        assert!(
+            arm.capsules.len() >= 4,
+            "a picture of an arm: {:?}",
+            arm.capsules
         );
     }
 }
