@@ -44,6 +44,9 @@ const FRAME: Duration = Duration::from_millis(25);
 /// A page that takes nothing for this long is left.
 const STALLED: Duration = Duration::from_secs(5);
 
+/// A page that is left gets this long to hear why.
+const FAREWELL: Duration = Duration::from_secs(1);
+
 /// Commands a page may say within a second; 125 of them move the hand.
 const MOST_COMMANDS: u32 = 400;
 
@@ -203,13 +206,13 @@ async fn socket(State(shared): State<Arc<Shared>>, upgrade: WebSocketUpgrade) ->
 /// One page, as long as it is there. Listening and telling do not wait for each other.
 async fn page(shared: &Shared, socket: WebSocket) {
     let number = shared.numbers.fetch_add(1, Ordering::Relaxed);
-    let (mut out, heard) = socket.split();
+    let (mut out, mut heard) = socket.split();
     let commands = &shared.port.commands;
     // A daemon that takes nothing has more to do than to know who looks.
     let _ = commands.try_send((number, Said::Here));
     let why = tokio::select! {
         why = tell(&mut out, shared, number) => why,
-        why = listen(heard, commands, number) => why,
+        why = listen(&mut heard, commands, number) => why,
     };
     // If there is no room for it, the lease says the same.
     let _ = commands.try_send((number, Said::Gone));
@@ -218,7 +221,12 @@ async fn page(shared: &Shared, socket: WebSocket) {
             code: 1008,
             reason: why.into(),
         };
-        let _ = timeout(STALLED, out.send(Message::Close(Some(frame)))).await;
+        let farewell = async {
+            let _ = out.send(Message::Close(Some(frame))).await;
+            // What is still on its way is read, or the connection would be reset before the page has heard why.
+            while let Some(Ok(_)) = heard.next().await {}
+        };
+        let _ = timeout(FAREWELL, farewell).await;
     }
 }
 
@@ -274,7 +282,7 @@ async fn tell(
 }
 
 async fn listen(
-    mut heard: SplitStream<WebSocket>,
+    heard: &mut SplitStream<WebSocket>,
     commands: &mpsc::Sender<(u64, Said)>,
     number: u64,
 ) -> Option<String> {

