@@ -10,7 +10,10 @@ use telemime_sim::link::{
     LinkConfig, Loss, Rate, parse_duration_s, parse_probability, parse_rate_bit_s,
 };
 
-use crate::{codec, demo, evaluate, ingest, link, paper, recognise, select, tap, teach};
+use crate::{
+    arm, codec, demo, evaluate, experiment, ingest, link, paper, recognise, replay, select, tap,
+    teach,
+};
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
 /// network delay behind it.
@@ -25,10 +28,11 @@ struct Cli {
     demo: demo::Args,
 }
 
+#[expect(clippy::large_enum_variant, reason = "there is one, parsed once")]
 #[derive(Subcommand)]
 enum Command {
     /// Both daemons as two processes over a shaped link, and what became of the delay.
-    Demo(demo::Args),
+    Demo(Box<demo::Args>),
     /// Make demonstrations of raw recordings: skeletons, or tables of a hand's path.
     Import(Box<ingest::Args>),
     /// Learn a skill from a folder of demonstrations and save it.
@@ -51,11 +55,18 @@ enum Command {
     Operator(Box<telemime_operator::cli::Args>),
     /// The robot daemon: an arm that follows.
     Robot(telemime_robot::cli::Args),
+    /// Run a robot's black box again, and tell what happened.
+    Replay(replay::Args),
+    Arm(arm::Args),
     Identity(admin::IdentityArgs),
     Pair(telemime_operator::cli::PairArgs),
     Peers(admin::PeersArgs),
     /// Measure the input's latency from taps on a table.
     Tap(tap::Args),
+    /// A plan's runs: both daemons on a virtual clock, and what they are held against.
+    Experiment(Box<experiment::Args>),
+    /// The results of an experiment as one HTML page.
+    Report(experiment::report::Args),
     /// A UDP relay that delays, loses and throttles what passes.
     Link(Box<link::Args>),
     /// Reproduce the tables of the source publication beside ours.
@@ -151,10 +162,14 @@ pub fn main() -> ExitCode {
         Some(Command::Tap(args)) => tap::run(args),
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),
+        Some(Command::Replay(args)) => replay::run(args),
+        Some(Command::Arm(args)) => arm::run(args),
         Some(Command::Identity(args)) => admin::identity(args, Role::Operator),
         Some(Command::Pair(args)) => telemime_operator::cli::pair(args),
         Some(Command::Peers(args)) => admin::peers(args),
         Some(Command::Link(args)) => link::run(args),
+        Some(Command::Experiment(args)) => experiment::run(args),
+        Some(Command::Report(args)) => experiment::report::run(args),
         Some(Command::Paper(args)) => paper::run(args),
     };
     match done {

@@ -8,10 +8,12 @@ macro_rules! say {
     }};
 }
 
+mod arm;
 pub mod cli;
 mod codec;
 mod demo;
 mod evaluate;
+mod experiment;
 mod figure;
 pub mod ground;
 mod ingest;
@@ -21,6 +23,7 @@ mod paper;
 mod picture;
 mod recognise;
 pub mod relay;
+mod replay;
 mod select;
 mod tap;
 mod teach;

@@ -102,14 +102,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             down: args.ways.down(),
             seed: args.ways.shape.link_seed,
         };
-        let relay = Relay::bind(config, HostClock::new())
-            .await
-            .with_context(|| {
-                format!(
-                    "cannot listen on {}: choose another --listen, or stop what uses it",
-                    args.listen
-                )
-            })?;
+        let relay = Relay::bind(config, HostClock::new()).with_context(|| {
+            format!(
+                "cannot listen on {}: choose another --listen, or stop what uses it",
+                args.listen
+            )
+        })?;
         say!(
             "relaying {} to {}; up: {}; down: {}; Ctrl-C ends it",
             relay.local_addr()?,

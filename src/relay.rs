@@ -1,7 +1,6 @@
 //! A UDP relay that shapes what passes: `sim::link` between two real processes.
 
-use std::cmp::Reverse;
-use std::collections::{BTreeMap, BinaryHeap};
+use std::collections::BTreeMap;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::Arc;
@@ -12,7 +11,10 @@ use telemime_endpoint::{HostClock, Mono};
 use telemime_sim::link::{Damage, Link, LinkConfig, Outcome};
 use tokio::net::UdpSocket;
 use tokio::sync::{mpsc, watch};
-use tokio::time::sleep_until;
+
+mod courier;
+
+use courier::{Courier, Parcel};
 
 /// Clients remembered; the one silent for longest makes room for the next.
 const MAX_CLIENTS: usize = 64;
@@ -107,25 +109,25 @@ impl Fate {
 /// A bound relay.
 #[derive(Debug)]
 pub struct Relay {
-    socket: Arc<UdpSocket>,
+    socket: UdpSocket,
+    /// The same socket, for the courier.
+    near: Arc<std::net::UdpSocket>,
     config: RelayConfig,
     clock: HostClock,
     shapes: watch::Receiver<Option<LinkConfig>>,
 }
 
-struct Packet {
-    up: bool,
-    client: SocketAddr,
-    at: Mono,
-    bytes: Vec<u8>,
-    fate: Fate,
-    copy: bool,
-}
-
 struct Client {
-    far: Arc<UdpSocket>,
+    far: Arc<std::net::UdpSocket>,
     last: Mono,
     reader: tokio::task::JoinHandle<()>,
+}
+
+/// A socket to read by here, and to write by elsewhere.
+fn both(socket: std::net::UdpSocket) -> io::Result<(UdpSocket, Arc<std::net::UdpSocket>)> {
+    socket.set_nonblocking(true)?;
+    let written = socket.try_clone()?;
+    Ok((UdpSocket::from_std(socket)?, Arc::new(written)))
 }
 
 impl Relay {
@@ -133,10 +135,11 @@ impl Relay {
     ///
     /// # Errors
     /// The system's, for example when the port is taken.
-    pub async fn bind(config: RelayConfig, clock: HostClock) -> io::Result<Self> {
-        let socket = Arc::new(UdpSocket::bind(config.listen).await?);
+    pub fn bind(config: RelayConfig, clock: HostClock) -> io::Result<Self> {
+        let (socket, near) = both(std::net::UdpSocket::bind(config.listen)?)?;
         Ok(Self {
             socket,
+            near,
             config,
             clock,
             shapes: watch::channel(None).1,
@@ -166,15 +169,10 @@ impl Relay {
         let mut down = Link::new(self.config.down.clone(), seed_down).beginning_at(began);
         let mut clients: BTreeMap<SocketAddr, Client> = BTreeMap::new();
         let (tx, mut from_far) = mpsc::channel::<(SocketAddr, Vec<u8>)>(READ_AHEAD);
-        // Packets on their way: by time of delivery, then by order of arrival.
-        let mut due: BinaryHeap<Reverse<(i64, u64)>> = BinaryHeap::new();
-        let mut flying: BTreeMap<u64, Packet> = BTreeMap::new();
-        let mut count = 0;
+        let (done, mut done_rx) = mpsc::unbounded_channel();
+        let courier = Courier::start(self.clock, done);
         let mut buffer = vec![0; MAX_PACKET];
         loop {
-            let next = due
-                .peek()
-                .map(|Reverse((at, _))| self.clock.instant(Mono(*at)));
             let (is_up, client, at, bytes) = tokio::select! {
                 biased;
                 () = told(&mut quit) => break,
@@ -186,20 +184,14 @@ impl Relay {
                     }
                     continue;
                 }
-                () = sleep_until(next.unwrap_or_else(tokio::time::Instant::now)), if next.is_some() => {
-                    let now = self.clock.now();
-                    while let Some(&Reverse((at, id))) = due.peek() && at <= now.0 {
-                        due.pop();
-                        let Some(packet) = flying.remove(&id) else { continue };
-                        let sent = self.deliver(&packet, &clients).await;
-                        passages(passage(&packet, if sent { packet.fate } else { Fate::Refused }, sent.then_some(now)));
-                    }
+                Some(passage) = done_rx.recv() => {
+                    passages(passage);
                     continue;
                 }
                 received = self.socket.recv_from(&mut buffer) => match received {
                     Ok((len, client)) => {
                         let at = self.clock.now();
-                        if !self.know(client, at, &mut clients, &tx).await {
+                        if !self.know(client, at, &mut clients, &tx) {
                             continue;
                         }
                         (true, client, at, buffer[..len].to_vec())
@@ -215,48 +207,49 @@ impl Relay {
                 fate.duplicate.map(|o| (o, true)),
                 Some((fate.packet, false)),
             ];
-            let mut bytes = Some(bytes);
             for (outcome, copy) in copies.into_iter().flatten() {
-                let bytes = if copy { bytes.clone() } else { bytes.take() };
-                let mut packet = Packet {
-                    up: is_up,
-                    client,
+                let mut bytes = bytes.clone();
+                let (fate, at_ns) = arrival(outcome, &mut bytes);
+                let passage = Passage {
                     at,
-                    bytes: bytes.unwrap_or_default(),
-                    fate: Fate::Passed,
+                    up: is_up,
+                    len_bytes: bytes.len() + IP_UDP_HEADER as usize,
+                    out: None,
+                    fate,
                     copy,
                 };
-                let (fate, at_ns) = arrival(outcome, &mut packet.bytes);
-                packet.fate = fate;
-                match at_ns {
-                    Some(at_ns) => {
-                        count += 1;
-                        due.push(Reverse((at_ns, count)));
-                        flying.insert(count, packet);
-                    }
-                    None => passages(passage(&packet, fate, None)),
-                }
+                let by = if is_up {
+                    clients.get(&client).map(|c| &c.far)
+                } else {
+                    Some(&self.near)
+                };
+                let Some(at_ns) = at_ns else {
+                    passages(passage);
+                    continue;
+                };
+                let Some(by) = by else {
+                    let fate = Fate::Refused;
+                    passages(Passage { fate, ..passage });
+                    continue;
+                };
+                courier.take(Parcel {
+                    at_ns,
+                    bytes,
+                    by: by.clone(),
+                    to: (!is_up).then_some(client),
+                    passage,
+                });
             }
         }
         clients.values().for_each(|client| client.reader.abort());
-    }
-
-    async fn deliver(&self, packet: &Packet, clients: &BTreeMap<SocketAddr, Client>) -> bool {
-        if !packet.up {
-            return self
-                .socket
-                .send_to(&packet.bytes, packet.client)
-                .await
-                .is_ok();
-        }
-        match clients.get(&packet.client) {
-            Some(client) => client.far.send(&packet.bytes).await.is_ok(),
-            None => false,
+        drop(courier);
+        while let Ok(passage) = done_rx.try_recv() {
+            passages(passage);
         }
     }
 
     /// Makes sure there is a socket that stands for `client` on the far side.
-    async fn know(
+    fn know(
         &self,
         client: SocketAddr,
         now: Mono,
@@ -281,14 +274,15 @@ impl Relay {
         } else {
             Ipv6Addr::UNSPECIFIED.into()
         };
-        let Ok(far) = UdpSocket::bind((any, 0)).await else {
+        let open = || {
+            let far = std::net::UdpSocket::bind((any, 0))?;
+            far.connect(self.config.to)?;
+            both(far)
+        };
+        let Ok((read_by, far)) = open() else {
             return false;
         };
-        if far.connect(self.config.to).await.is_err() {
-            return false;
-        }
-        let far = Arc::new(far);
-        let reader = tokio::spawn(read(far.clone(), client, tx.clone()));
+        let reader = tokio::spawn(read(read_by, client, tx.clone()));
         clients.insert(
             client,
             Client {
@@ -301,7 +295,7 @@ impl Relay {
     }
 }
 
-async fn read(far: Arc<UdpSocket>, client: SocketAddr, tx: mpsc::Sender<(SocketAddr, Vec<u8>)>) {
+async fn read(far: UdpSocket, client: SocketAddr, tx: mpsc::Sender<(SocketAddr, Vec<u8>)>) {
     let mut buffer = vec![0; MAX_PACKET];
     loop {
         // An error is an ICMP answer to an earlier packet (nobody listens there yet): wait for the next.
@@ -327,16 +321,5 @@ fn arrival(outcome: Outcome, bytes: &mut [u8]) -> (Fate, Option<i64>) {
         Some(true) => (Fate::Corrupted, Some(delivery.at_ns)),
         None if delivery.at_once => (Fate::Overtook, Some(delivery.at_ns)),
         None => (Fate::Passed, Some(delivery.at_ns)),
-    }
-}
-
-fn passage(packet: &Packet, fate: Fate, out: Option<Mono>) -> Passage {
-    Passage {
-        at: packet.at,
-        up: packet.up,
-        len_bytes: packet.bytes.len() + IP_UDP_HEADER as usize,
-        out,
-        fate,
-        copy: packet.copy,
     }
 }

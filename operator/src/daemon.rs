@@ -220,7 +220,7 @@ impl Console<'_> {
                         "there is no link: the emergency stop is the first thing the robot will hear"
                     }
                     Word::Reset => "there is no link: the reset is discarded",
-                    Word::Pair(_) | Word::Yes | Word::No => NOT_HERE,
+                    Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => NOT_HERE,
                     Word::Keep | Word::Refine | Word::Save(_) => {
                         "there is no link: say it again when it is back"
                     }
@@ -492,7 +492,7 @@ impl Daemon {
                     Word::Stop => session.stop(self.now()),
                     Word::Reset if session.reset() => {}
                     Word::Reset => console.note("the reset is discarded: the robot has not confirmed the stop yet"),
-                    Word::Pair(_) | Word::Yes | Word::No => console.note(NOT_HERE),
+                    Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => console.note(NOT_HERE),
                     word @ (Word::Keep | Word::Refine | Word::Save(_)) => {
                         let said = self.lesson(&word, session, lessons, notices);
                         if let Err(e) = said {
@@ -594,7 +594,7 @@ impl Daemon {
                 lessons.save(file)?;
                 let _ = notices.send(Notice::Saved(file.clone()));
             }
-            Word::Stop | Word::Reset | Word::Pair(_) | Word::Yes | Word::No => {}
+            Word::Stop | Word::Reset | Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => {}
         }
         Ok(())
     }

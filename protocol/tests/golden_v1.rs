@@ -4,6 +4,7 @@ use telemime_protocol::wire::arm::{WireArm, WireCapsule, WireJoint, WireJointKin
 use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::KnotBlock;
+use telemime_protocol::wire::memory::WireMemory;
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::*;
@@ -11,8 +12,10 @@ use telemime_protocol::wire::v1::*;
 const STATE: WireState = WireState {
     t_us: 1_234_567,
     x: [1000, -2500, 25_000],
-    memory_exponent: 3,
-    memory: [[1, -1, 2], [-2, 3, -3], [40, -50, 60], [127, -128, 0]],
+    memory: WireMemory {
+        exponents: [0x12, 0x3f],
+        offsets: [[1, -1, 2], [-2, 3, -3], [40, -50, 60], [127, -128, 0]],
+    },
 };
 
 const PARAMS: WireParams = WireParams {
@@ -24,8 +27,10 @@ const PARAMS: WireParams = WireParams {
 const POSE: WirePose = WirePose {
     turn: Some(WireTurn {
         q: WireRotation([10_000, -31_416, 0]),
-        memory_exponent: 4,
-        memory: [[1, 2, 3], [-1, -2, -3], [127, -128, 0], [5, 6, 7]],
+        memory: WireMemory {
+            exponents: [0x14, 0x0a],
+            offsets: [[1, 2, 3], [-1, -2, -3], [127, -128, 0], [5, 6, 7]],
+        },
         params: PARAMS,
     }),
     grip: Some(100),
@@ -89,13 +94,13 @@ fn operator_control() {
         ),
         (
             engage(mirror(WirePose::default())),
-            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ff90c81e14963c2864501e0000 \
+            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28ce3c7f8000fb1032ff90c81e14963c2864501e0000 \
              0000003e0000003f000000bf0000003f0000003ffb204efb3582fb8a02",
         ),
         (
             engage(mirror(POSE)),
-            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb1032ff90c81e14963c2864501e \
-             01fb204efb6ff50004010203fffefd7f8000050607ff90c81e14963c2864501e0164 \
+            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28ce3c7f8000fb1032ff90c81e14963c2864501e \
+             01fb204efb6ff500140a010203fffefd7f8000050607ff90c81e14963c2864501e0164 \
              0000003e0000003f000000bf0000003f0000003ffb204efb3582fb8a02",
         ),
         (
@@ -109,7 +114,7 @@ fn operator_control() {
                 first_knot: 300,
                 knots: KnotBlock(vec![0x80, 0x7f, 0xff]),
             }),
-            "0303fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28ce3c7f8000fb2c0103807fff",
+            "0303fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28ce3c7f8000fb2c0103807fff",
         ),
         (OperatorControl::Release { engagement: 3 }, "0403"),
         (OperatorControl::EmergencyStop, "05"),
@@ -265,18 +270,18 @@ fn operator_datagrams() {
     pinned(vec![
         (
             motion(Some(0xdead_beef), WirePose::default(), knots),
-            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e01fcefbeaddefc0ead2500fbd007fb8713fb50c30301ff \
+            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e01fcefbeaddefc0ead2500fbd007fb8713fb50c3123f01ff \
              02fe03fd28ce3c7f80000000fa045a00c3fe",
         ),
         (
             motion(None, WirePose::default(), KnotBlock::default()),
-            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
+            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28 \
              ce3c7f80000000fa00",
         ),
         (
             motion(None, POSE, KnotBlock::default()),
-            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c30301ff02fe03fd28 \
-             ce3c7f800001fb204efb6ff50004010203fffefd7f8000050607ff90c81e14963c2864501e0164fa00",
+            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28 \
+             ce3c7f800001fb204efb6ff500140a010203fffefd7f8000050607ff90c81e14963c2864501e0164fa00",
         ),
         (go(None), "010103fbfb00fc0ead2500fb8a0200"),
         (
@@ -300,7 +305,7 @@ fn operator_datagrams() {
                     weight: [127, -64, 0, 64, 1, 100],
                 }),
             })),
-            "010103fbfb00fc0ead2500fb8a0201fcc0c62d008000000001fc0ead2500fbd007fb8713fb50c303 \
+            "010103fbfb00fc0ead2500fb8a0201fcc0c62d008000000001fc0ead2500fbd007fb8713fb50c3123f \
              01ff02fe03fd28ce3c7f8000ff807fc000400164",
         ),
         (
@@ -388,6 +393,7 @@ fn enumerations() {
         Cause::LocalStop,
         Cause::ClockStep,
         Cause::Fault,
+        Cause::ArmFault,
     ];
     let refusals = [
         Refusal::Stopped,

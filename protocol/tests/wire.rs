@@ -14,6 +14,7 @@ use telemime_protocol::wire::arm::{WireArm, WireCapsule, WireJoint, WireJointKin
 use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
+use telemime_protocol::wire::memory::WireMemory;
 use telemime_protocol::wire::state::{MAX_POSITION_M, POSITION_STEP_M, WireState};
 use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::*;
@@ -32,15 +33,16 @@ fn state() -> impl Strategy<Value = WireState> {
     (
         t_us,
         [-limit..=limit, -limit..=limit, -limit..=limit],
-        0..=20u8,
-        any::<[[i8; 3]; 4]>(),
+        memory(any::<u8>().boxed()),
     )
-        .prop_map(|(t_us, x, memory_exponent, memory)| WireState {
-            t_us,
-            x,
-            memory_exponent,
-            memory,
-        })
+        .prop_map(|(t_us, x, memory)| WireState { t_us, x, memory })
+}
+
+/// Any offsets, with bytes of exponents.
+fn memory(exponents: BoxedStrategy<u8>) -> impl Strategy<Value = WireMemory> {
+    let exponents = [exponents.clone(), exponents];
+    (exponents, any::<[[i8; 3]; 4]>())
+        .prop_map(|(exponents, offsets)| WireMemory { exponents, offsets })
 }
 
 fn params() -> impl Strategy<Value = WireParams> {
@@ -62,14 +64,9 @@ fn rotation() -> impl Strategy<Value = WireRotation> {
 }
 
 fn pose() -> impl Strategy<Value = WirePose> {
-    let turn = (rotation(), 0..=10u8, any::<[[i8; 3]; 4]>(), params()).prop_map(
-        |(q, memory_exponent, memory, params)| WireTurn {
-            q,
-            memory_exponent,
-            memory,
-            params,
-        },
-    );
+    let exponents = (0..=10u8, 0..=10u8).prop_map(|(a, b)| a << 4 | b);
+    let turn = (rotation(), memory(exponents.boxed()), params())
+        .prop_map(|(q, memory, params)| WireTurn { q, memory, params });
     (option::of(turn), option::of(any::<u8>())).prop_map(|(turn, grip)| WirePose { turn, grip })
 }
 
@@ -164,6 +161,7 @@ fn cause() -> impl Strategy<Value = Cause> {
         Cause::LocalStop,
         Cause::ClockStep,
         Cause::Fault,
+        Cause::ArmFault,
     ])
 }
 
@@ -601,25 +599,24 @@ proptest! {
         }
     }
 
-    /// Position to 0.05 mm, time to half a microsecond, memories to half of their step: 1/254 of the largest
-    /// offset, or 12.5 µm if that is more; the memories' origin is itself rounded.
+    /// Position to 0.05 mm, time to half a microsecond, each memory to half of its own step: 1/127 of its largest
+    /// coordinate, or 12.5 µm if that is more, however far the others are.
     #[test]
     fn a_state_travels_within_its_steps(
         t_ns in -1_000_000_000_000_000i64..1_000_000_000_000_000,
         x in prop::array::uniform3(-100.0..=100.0f64),
         offsets in prop::array::uniform4(prop::array::uniform3(-1.0..1.0f64)),
-        reach_m in prop_oneof![Just(0.0), 1e-6..1e-3f64, 1e-3..10.0f64, 10.0..3000.0f64],
+        reaches_m in prop::array::uniform4(prop_oneof![Just(0.0), 1e-6..1e-3f64, 1e-3..10.0f64, 10.0..104.0f64]),
     ) {
         let x = Vector3::from(x);
-        let offsets = offsets.map(|o| Vector3::from(o) * reach_m);
+        let offsets: [_; 4] = std::array::from_fn(|i| Vector3::from(offsets[i]) * reaches_m[i]);
         let sent = HandState { t: Stamp(t_ns), x, memory: offsets.map(|o| x - o) };
         let wire = WireState::quantise(&sent).expect("within range");
         let back = wire.dequantise();
         prop_assert!((back.t.0 - t_ns).abs() <= 500);
         prop_assert!((back.x - x).amax() <= 0.5 * POSITION_STEP_M + 1e-12);
-        let largest = offsets.iter().map(|o| o.amax()).fold(0.0, f64::max);
-        let bound_m = (largest / 127.0).max(1.25e-5) + 1e-9;
         for (memory, offset) in back.memory.iter().zip(&offsets) {
+            let bound_m = (offset.amax() / 127.0).max(1.25e-5) + 1e-9;
             let error_m = (back.x - memory - offset).amax();
             prop_assert!(error_m <= bound_m, "{error_m} m of {bound_m} m");
         }
@@ -759,12 +756,12 @@ fn a_state_that_no_integers_hold_is_not_sent() {
         state.memory[3] = Vector3::new(0.0, m, 0.0);
         WireState::quantise(&state)
     };
-    assert!(at(100.0, 0.0).is_some() && at(-100.0, 3000.0).is_some());
+    assert!(at(100.0, 4.0).is_some() && at(-100.0, 104.0).is_some());
     for (x, m) in [
         (100.1, 0.0),
         (f64::NAN, 0.0),
         (f64::INFINITY, 0.0),
-        (0.0, 4000.0),
+        (0.0, 104.1),
         (0.0, 1e300),
         (0.0, f64::INFINITY),
     ] {

@@ -2,32 +2,38 @@
 
 mod record;
 mod report;
+mod surroundings;
 
 use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use serde::Deserialize;
 use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
 use telemime_endpoint::pairing::Own;
 use telemime_endpoint::peers::{Role, Source, Whom};
 use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Trust, quic};
-use telemime_sim::arm::LoadOptions;
+use telemime_sim::arm::{LoadOptions, Payload};
 use telemime_sim::link::parse_duration_s;
+use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
+use crate::blackbox::{Header, Keeper, Recorder, SPAN_S, Saved, taps};
 use crate::clock::Origin;
 use crate::control::ControlConfig;
-use crate::daemon::{Daemon, Notice};
+use crate::daemon::{Daemon, Failure, Notice};
 use crate::desk::Desk;
+use crate::driver::PATIENCE_S;
+use crate::driver::bridge::{Bridge, Words};
 use crate::refused::Refused;
 use crate::rig::{Rig, RigOptions};
-use crate::servo::{self, Ticket};
+use crate::servo::thread::Servo;
+use crate::servo::{self, Priority, Ticket};
 use crate::session::SessionConfig;
-use record::Recorder;
+use record::TickRecorder;
 pub use report::Event;
 use report::{Log, engaged, nth};
 
@@ -35,7 +41,7 @@ use report::{Log, engaged, nth};
 ///
 /// Nobody is let in whose key is not known: pair an operator (--pair, or pair on the terminal, and `telemime pair`
 /// at the operator), or give the fingerprint it prints with --peer. On the terminal, type stop (emergency stop,
-/// latched), reset, pair, yes, no or quit.
+/// latched; SIGUSR1 does the same), reset, blackbox, pair, yes, no or quit.
 #[derive(clap::Args, Debug, Clone, Default)]
 pub struct Args {
     /// Read settings from this TOML file; flags override it.
@@ -83,10 +89,19 @@ pub struct Args {
         allow_negative_numbers = true
     )]
     pub start: Option<Vec<f64>>,
+    /// What the tip carries: KG, KG@X,Y,Z (centre, m from the tip) or KG@X,Y,Z@IXX,IYY,IZZ (moments, kg·m²).
+    #[arg(long, value_name = "KG[@X,Y,Z]")]
+    pub payload: Option<Payload>,
+    /// The tip, and the links that start there, stay above this height over the base, m.
+    #[arg(long, value_name = "Z", allow_negative_numbers = true)]
+    pub keep_above: Option<f64>,
+    /// A surface the simulated tip may touch: all points with NX·x + NY·y + NZ·z = D, m, solid behind.
+    #[arg(long, value_name = "NX,NY,NZ,D", allow_negative_numbers = true, value_parser = surroundings::four)]
+    pub contact_plane: Option<[f64; 4]>,
     /// The arm obeys this much late, 0 to 50ms; the prediction makes up for it [default: 0ms].
     #[arg(long, value_name = "TIME", value_parser = parse_duration_s)]
     pub dead_time: Option<f64>,
-    /// Bandwidth of the filter between prediction and arm, rad/s: less is smoother, and farther behind [default: 45].
+    /// Bandwidth of the filter between prediction and arm, rad/s: less is smoother, and farther behind [default: 40].
     #[arg(long, value_name = "RAD_S")]
     pub bandwidth: Option<f64>,
     /// Speak protocol versions up to this one; 2 is an experiment [default: 1].
@@ -95,6 +110,19 @@ pub struct Args {
     /// Write every tick to this CSV file.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
+    /// Drive a real arm: this command (run by sh) tells its joints' state and takes setpoints, a JSON line each; docs/driver.md.
+    #[arg(long, value_name = "COMMAND", conflicts_with = "start")]
+    pub driver: Option<String>,
+    /// The driver may be silent, or behind its setpoints, for this long before the arm is stopped [default: 100ms].
+    #[arg(long, value_name = "TIME", value_parser = parse_duration_s)]
+    pub driver_patience: Option<f64>,
+    /// Run the servo at this real-time priority, 1 to 99 [50 if nothing is said], and lock memory, where the system allows it.
+    #[arg(long, value_name = "PRIO", num_args = 0..=1, default_missing_value = "50")]
+    pub realtime: Option<u8>,
+    /// Keep the last two minutes of all that the servo is told and decides, and write them to this folder at every stop or
+    /// fault, on `blackbox` or on SIGUSR2; `telemime replay` reads them.
+    #[arg(long, value_name = "DIR")]
+    pub black_box: Option<PathBuf>,
     /// Print events as JSON lines on stdout.
     #[arg(long)]
     pub json: bool,
@@ -119,13 +147,30 @@ struct File {
     #[serde(default)]
     fixed: std::collections::BTreeMap<String, f64>,
     start: Option<Vec<f64>>,
+    payload: Option<String>,
+    keep_above_m: Option<f64>,
+    /// Normal and place of each: what has n·x ≥ d is allowed.
+    #[serde(default)]
+    planes: Vec<[f64; 4]>,
+    self_collision: Option<bool>,
+    stop_distance_m: Option<f64>,
+    slow_distance_m: Option<f64>,
+    contact_plane: Option<[f64; 4]>,
     dead_time_s: Option<f64>,
     bandwidth_rad_s: Option<f64>,
     protocol_max: Option<u16>,
     record: Option<PathBuf>,
+    driver: Option<String>,
+    driver_patience_s: Option<f64>,
+    realtime: Option<u8>,
+    black_box: Option<PathBuf>,
 }
 
-fn parse_fixed(text: &str) -> Result<(String, f64), String> {
+/// `JOINT=VALUE` as a joint's name and its value, rad or m.
+///
+/// # Errors
+/// What is wrong with the text.
+pub fn parse_fixed(text: &str) -> Result<(String, f64), String> {
     let (joint, value) = text.split_once('=').ok_or("write JOINT=VALUE")?;
     let value = value
         .parse::<f64>()
@@ -150,6 +195,9 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         Some(path) => read_config(path)?,
         None => File::default(),
     };
+    let barrier = surroundings::barrier(args, &file)?;
+    let contact = surroundings::contact(args, &file)?;
+    let payload = surroundings::payload(args, &file)?;
     let identity = args.identity.clone().or(file.identity);
     let key_file = identity.unwrap_or_else(|| admin::key_file(Role::Robot));
     let identity = Identity::load_or_create(&key_file)?;
@@ -181,24 +229,52 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let mut desk = Desk::new(own, trust.clone(), Some(source.path.clone())).expecting(expected);
     let mut fixed = file.fixed;
     fixed.extend(args.fixed.iter().cloned());
+    let driver = args.driver.clone().or(file.driver);
+    let mut bridge = driver.as_deref().map(Bridge::start).transpose()?;
+    let patience_s = args
+        .driver_patience
+        .or(file.driver_patience_s)
+        .unwrap_or(PATIENCE_S);
+    anyhow::ensure!(
+        (0.01..=10.0).contains(&patience_s),
+        "--driver-patience {patience_s} s: from 10ms to 10s"
+    );
+    let priority = args.realtime.or(file.realtime);
+    let priority = priority.map(Priority::new).transpose()?;
+    let start = match &bridge {
+        Some(bridge) if file.start.is_none() => Some(bridge.posture()),
+        Some(_) => {
+            bail!("start and driver: an arm behind a driver starts where it is; leave one out")
+        }
+        None => args.start.clone().or(file.start),
+    };
     let options = RigOptions {
         urdf: args.urdf.clone().or(file.urdf),
         load: LoadOptions {
             tip: args.tip.clone().or(file.tip),
             fixed,
+            payload,
         },
-        start: args.start.clone().or(file.start),
+        contact,
+        start,
+        driver: bridge.is_some(),
         control: ControlConfig {
             dead_time_s: args.dead_time.or(file.dead_time_s).unwrap_or(0.0),
             omega: args
                 .bandwidth
                 .or(file.bandwidth_rad_s)
                 .unwrap_or(ControlConfig::default().omega),
+            barrier,
             ..ControlConfig::default()
         },
         ..RigOptions::default()
     };
-    let rig = Rig::load(&options)?;
+    let (urdf, text) = Rig::text(options.urdf.as_deref())?;
+    if let Some(bridge) = &bridge {
+        // Before the posture is looked at: it is one of the driver's joints.
+        bridge.fits(&Rig::arm(&urdf, &text, &options)?)?;
+    }
+    let rig = Rig::read(urdf, &text, &options)?;
     // Of our own arm there is nothing to tell.
     if options.urdf.is_some() {
         for notice in rig.arm.notices() {
@@ -209,7 +285,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         .record
         .clone()
         .or(file.record)
-        .map(|path| Recorder::start(&path, rig.arm.dof()))
+        .map(|path| TickRecorder::start(&path, rig.arm.dof()))
         .transpose()?;
     let listen = args
         .listen
@@ -232,16 +308,45 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let endpoint = quic::server(&identity, &trust, socket, &Meter::default())?;
     let addr = endpoint.local_addr()?;
     let (rings, handle) = servo::rings();
-    let running = servo::thread::Servo::start(rig.servo(rings)).context("no servo thread")?;
-    let brake = handle.brake.clone();
-    let (quit, words) = cli::listen(args.follow_stdin, cli::ROBOT_WORDS, move || {
-        brake.stop_here()
-    })?;
+    let mut station = match &mut bridge {
+        Some(bridge) => {
+            let arm = bridge.arm(rig.arm.clone(), patience_s)?;
+            rig.servo_before(Box::new(arm), bridge.state.opening, rings)
+        }
+        None => rig.servo(rings),
+    };
     let (out, printing) = Printer::start().context("no thread to print from")?;
     let log = Log {
         json: args.json,
         out,
     };
+    let keeper = match args.black_box.clone().or(file.black_box) {
+        Some(dir) => {
+            // Better now than after the stop that it was for.
+            std::fs::create_dir_all(&dir)
+                .and_then(|()| tempfile::tempfile_in(&dir))
+                .with_context(|| format!("--black-box {} cannot be written", dir.display()))?;
+            let (tap, feed) = taps(&station.room());
+            station = station.recorded(tap);
+            let recorder = Recorder::new(Header::new(&rig, driver.clone()), feed, SPAN_S);
+            let log = log.clone();
+            let say = move |due, saved: Saved| log.black_box(due, &saved);
+            Some(Keeper::start(recorder, &dir, say).context("no thread for the black box")?)
+        }
+        None => None,
+    };
+    let asker = keeper.as_ref().map(Keeper::asker);
+    let running = Servo::start(station, priority).context("no servo thread")?;
+    let (brake, by_signal) = (handle.brake.clone(), handle.brake.clone());
+    on_signal(SignalKind::user_defined1(), move || by_signal.stop_here())?;
+    let by_signal = asker.clone();
+    on_signal(SignalKind::user_defined2(), move || match &by_signal {
+        Some(asker) => asker.ask(),
+        None => eprintln!("note: SIGUSR2, but there is no black box: give --black-box DIR"),
+    })?;
+    let (quit, words) = cli::listen(args.follow_stdin, cli::ROBOT_WORDS, move || {
+        brake.stop_here()
+    })?;
     log.say(
         &Event::Listening {
             addr,
@@ -261,6 +366,17 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
             )
         },
     );
+    if let Some(Bridge { command, hello, .. }) = &bridge {
+        let event = Event::Driver {
+            command: command.clone(),
+            joints: hello.joints.clone(),
+            rate_hz: hello.rate_hz,
+        };
+        log.say(&event, || format!("driver {command}, {} Hz", hello.rate_hz));
+    }
+    if let Some(granted) = &running.realtime {
+        log.realtime(granted);
+    }
     if let Some(span) = args.pair {
         log.pairing(&desk.open(span));
     }
@@ -278,38 +394,47 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     );
     let daemon = daemon
         .with_external(dispersion.map(External::host))
-        .showing(rig.described());
+        .showing(rig.described())
+        .with_black_box(asker);
     let (notices, heard) = mpsc::unbounded_channel();
-    let listener = tokio::spawn(listen_to(heard, log.clone(), recorder));
+    let listener = tokio::spawn(listen_to(
+        heard,
+        log.clone(),
+        recorder,
+        bridge.as_ref().map(Bridge::words),
+    ));
     let served = tokio::select! {
         served = daemon.run(quit, words, notices) => served,
         () = source.follow(&trust, |e| eprintln!("note: {e}; whoever was trusted still is")) => Ok(()),
     };
     let recorder = listener.await.context("the log ended early")?;
-    let (ticks, mean_ns, p99_ns, overruns) = running.timing.read();
-    // The servo outlives everything that could still ask for motion; it ends at rest.
+    let timing = running.timing.clone();
+    // The servo outlives everything that could still ask for motion; it ends at rest, and after it its driver and its record.
     drop(running);
-    log.say(
-        &Event::Servo {
-            ticks,
-            mean_ns,
-            p99_ns,
-            overruns,
-        },
-        || {
-            format!(
-                "servo: {ticks} ticks, {:.1} µs mean, {:.1} µs p99, {overruns} late",
-                f64::from(mean_ns) * 1e-3,
-                f64::from(p99_ns) * 1e-3
-            )
-        },
-    );
+    let words = bridge.as_ref().map(Bridge::words);
+    drop(bridge);
+    drop(keeper);
+    log.servo(&timing.read());
     drop(log);
     printing.finish();
     if let Some(recorder) = recorder {
         recorder.finish()?;
     }
-    Ok(served?)
+    match (served, words.and_then(|words| words.get())) {
+        (Err(failure @ Failure::Arm(_)), Some(words)) => bail!("{failure}: {words}"),
+        (served, _) => Ok(served?),
+    }
+}
+
+/// Calls `then` on every signal of that kind.
+fn on_signal(kind: SignalKind, then: impl Fn() + Send + 'static) -> anyhow::Result<()> {
+    let mut signals = signal(kind).context("signals cannot be caught")?;
+    tokio::spawn(async move {
+        while signals.recv().await.is_some() {
+            then();
+        }
+    });
+    Ok(())
 }
 
 fn read_config(path: &Path) -> anyhow::Result<File> {
@@ -321,14 +446,23 @@ fn read_config(path: &Path) -> anyhow::Result<File> {
 async fn listen_to(
     mut heard: mpsc::UnboundedReceiver<Notice>,
     log: Log,
-    mut recorder: Option<Recorder>,
-) -> Option<Recorder> {
+    mut recorder: Option<TickRecorder>,
+    words: Option<Words>,
+) -> Option<TickRecorder> {
     let (mut transitions, mut engagement) = (None, Ticket::default());
+    let mut faulty = false;
     while let Some(notice) = heard.recv().await {
         match notice {
             Notice::Report(report) => {
                 if let Some(recorder) = &mut recorder {
                     recorder.take(&report);
+                }
+                if let Some(fault) = report.fault.filter(|_| !faulty) {
+                    faulty = true;
+                    let words = words.as_ref().and_then(Words::get);
+                    let why = words.map_or_else(|| fault.to_string(), |w| format!("{fault}: {w}"));
+                    let text = format!("the arm: {why}");
+                    log.say(&Event::ArmFault { fault, why }, || text);
                 }
                 if transitions != Some(report.transitions) {
                     transitions = Some(report.transitions);

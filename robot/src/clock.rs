@@ -212,10 +212,12 @@ impl SessionClock {
             .map(|a| Stamp(mono.0.saturating_add(a.offset_ns.round() as i64)))
     }
 
-    /// Bound of the offset's error, s: half the best round trip and the drift since, whatever the path's asymmetry;
-    /// or the dispersions of both disciplined clocks.
+    /// Bound of the applied offset's error, s: half the best round trip and the drift since, whatever the path's asymmetry,
+    /// or the dispersions of both disciplined clocks; and how far what is applied has yet to follow.
     pub fn uncertainty_s(&self, now: Mono) -> Option<f64> {
-        self.estimate(now).map(|(_, bound_s)| bound_s)
+        let (target_ns, bound_s) = self.estimate(now)?;
+        let behind_ns = self.applied.map_or(0.0, |a| target_ns - a.offset_ns);
+        Some(bound_s + behind_ns.abs() * 1e-9)
     }
 
     /// The shortest round trip seen lately, s.
@@ -327,6 +329,8 @@ mod tests {
         assert_eq!(clock.slew(Mono(1050 * MS), true), Slew::Smooth);
         let moved = clock.to_session(Mono(0)).unwrap().0;
         assert_eq!(moved, 5 * MS, "5 ms in a second, no more");
+        let bound_s = clock.uncertainty_s(Mono(1050 * MS)).unwrap();
+        assert!(bound_s > 5e-3, "5 ms are yet to follow: {bound_s} s");
         exchange(&mut clock, 70 * MS, 500 * MS, 0, 0);
         assert_eq!(clock.slew(Mono(1051 * MS), true), Slew::Step);
         clock.observe(Mono(100), Stamp(0), Stamp(500), Mono(200));

@@ -17,12 +17,13 @@ use telemime_protocol::wire::v1::{Cause, Info, RobotState};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep_until};
 
+use crate::blackbox::Asker;
 use crate::clock::Origin;
 use crate::desk::{Desk, Progress};
 use crate::door::{self, Door, Place, Verdict};
 use crate::refused::{Reason, Refused, Tally};
 use crate::servo::thread::Timing;
-use crate::servo::{Handle, Order, Report};
+use crate::servo::{ArmFault, Handle, Order, Report};
 use crate::session::{Counters, Output, Session, SessionConfig, TickTiming};
 
 /// How often reports are taken from the servo's ring.
@@ -74,6 +75,8 @@ pub struct Daemon {
     external: Option<External>,
     refused: Tally,
     silent_drains: u32,
+    asker: Option<Asker>,
+    fault: Option<ArmFault>,
 }
 
 /// Something for a log.
@@ -139,10 +142,16 @@ struct Active {
     frames: mpsc::Receiver<Result<Frame, ControlError>>,
 }
 
-/// The servo has not reported for half a second: nothing drives the arm any more.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("the servo has stopped; see above for why, and start the robot again")]
-pub struct ServoDead;
+/// Why a robot cannot serve any more.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum Failure {
+    /// The servo has not reported for half a second: nothing drives the arm any more.
+    #[error("the servo has stopped; see above for why, and start the robot again")]
+    Servo,
+    /// The arm failed, or what drives it; it was stopped as far as it could be.
+    #[error("the arm was stopped: {0}")]
+    Arm(#[from] ArmFault),
+}
 
 impl Daemon {
     /// A daemon that serves `endpoint` and drives `servo`, whose timing is `timing` if it has a thread of its own.
@@ -168,6 +177,8 @@ impl Daemon {
             external: None,
             refused: Tally::default(),
             silent_drains: 0,
+            asker: None,
+            fault: None,
         }
     }
 
@@ -185,16 +196,23 @@ impl Daemon {
         self
     }
 
-    /// Serves operators until `quit` turns true; then the arm is stopped (latched) and the endpoint closed.
+    /// The same with a black box, to be asked for its record.
+    #[must_use]
+    pub fn with_black_box(mut self, asker: Option<Asker>) -> Self {
+        self.asker = asker;
+        self
+    }
+
+    /// Serves operators until `quit` turns true, or the arm fails; then the arm is stopped (latched) and the endpoint closed.
     ///
     /// # Errors
-    /// [`ServoDead`].
+    /// [`Failure`].
     pub async fn run(
         mut self,
         mut quit: watch::Receiver<bool>,
         mut words: mpsc::UnboundedReceiver<Word>,
         notices: mpsc::UnboundedSender<Notice>,
-    ) -> Result<(), ServoDead> {
+    ) -> Result<(), Failure> {
         let (arrivals_tx, mut arrivals) = mpsc::channel::<Arrival>(door::PLACES);
         let mut drain = interval(DRAIN);
         drain.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -217,6 +235,10 @@ impl Daemon {
                 Some(word) = words.recv() => match word {
                     Word::Stop => self.servo.brake.stop_here(),
                     Word::Reset => self.order(Order::Reset { operator: active.is_some(), stop: None }),
+                    Word::BlackBox => match &self.asker {
+                        Some(asker) => asker.ask(),
+                        None => eprintln!("note: there is no black box: start the robot with --black-box DIR"),
+                    },
                     Word::Pair(span) => {
                         let _ = notices.send(Notice::Pairing(self.desk.open(span)));
                     }
@@ -232,7 +254,10 @@ impl Daemon {
                     if self.silent_drains > MAX_SILENT_DRAINS {
                         self.end(&mut active, &mut skill, (FAULT, "the servo has stopped"), &notices);
                         self.endpoint.close(VarInt::from_u32(FAULT), b"the servo has stopped");
-                        return Err(ServoDead);
+                        return Err(Failure::Servo);
+                    }
+                    if self.fault.is_some() {
+                        break;
                     }
                 }
                 why = receive(active.as_mut(), &self.clock, self.external.as_ref(), &trust) => if let Some(why) = why {
@@ -287,18 +312,17 @@ impl Daemon {
                 break;
             }
         }
-        self.end(
-            &mut active,
-            &mut skill,
-            (CLOSED, "the robot daemon stops"),
-            &notices,
-        );
+        let why = match self.fault {
+            Some(fault) => (FAULT, format!("the arm was stopped: {fault}")),
+            None => (CLOSED, "the robot daemon stops".to_owned()),
+        };
+        self.end(&mut active, &mut skill, (why.0, &why.1), &notices);
         // The last words are written by their own task; a peer that does not take them is not waited for.
         let _ = tokio::time::timeout(LAST_WORDS, self.endpoint.wait_idle()).await;
         self.endpoint
             .close(VarInt::from_u32(CLOSED), b"the robot daemon stops");
         self.endpoint.wait_idle().await;
-        Ok(())
+        self.fault.map_or(Ok(()), |fault| Err(fault.into()))
     }
 
     /// Gives authority, or says why not.
@@ -409,16 +433,17 @@ impl Daemon {
             .timing
             .as_deref()
             .map_or_else(TickTiming::default, |timing| {
-                let (_, mean_ns, p99_ns, overruns) = timing.read();
+                let times = timing.read();
                 TickTiming {
-                    mean_ns,
-                    p99_ns,
-                    overruns,
+                    mean_ns: times.mean_ns,
+                    p99_ns: times.work.p99_ns,
+                    overruns: times.overruns,
                 }
             });
         while let Ok(report) = self.servo.reports.pop() {
             self.silent_drains = 0;
             self.info.state = report.state;
+            self.fault = report.fault;
             at_rest = report.state == RobotState::Stopped && !report.moving;
             if let Some(active) = active.as_deref_mut() {
                 active.session.handle_report(&report, timing);

@@ -4,12 +4,14 @@
 //! Data flows one way: datagram → [`session`] → [`servo`] (prediction, [`safety`], [`control`], arm) →
 //! report → [`session`] → telemetry.
 
+pub mod blackbox;
 pub mod cli;
 pub mod clock;
 pub mod control;
 pub mod daemon;
 pub mod desk;
 pub mod door;
+pub mod driver;
 pub mod refused;
 pub mod rig;
 pub mod safety;

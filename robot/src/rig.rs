@@ -1,18 +1,23 @@
 //! An arm, ready to be driven: model, start posture, limits, controller and plant.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use nalgebra::{Isometry3, Vector3};
-use telemime_protocol::wire::arm::{WireArm, WireCapsule, WireJoint, WireJointKind, WirePlace};
+use nalgebra::Isometry3;
+use telemime_protocol::wire::arm::{
+    MAX_CAPSULES, WireArm, WireCapsule, WireJoint, WireJointKind, WirePlace,
+};
 use telemime_protocol::wire::v1::{Info, RobotState};
 use telemime_sim::arm::{
-    ArmError, ArmModel, Gripper, JointKind, Joints, LoadOptions, Plant, PlantError, default_urdf,
+    ArmError, ArmModel, ContactPlane, Gripper, JointKind, Joints, LoadOptions, Plant, PlantError,
+    default_urdf,
 };
 
 use crate::control::{ControlConfig, ControlError, Controller, home_posture, workspace_radius};
 use crate::safety::SafetyConfig;
-use crate::servo::{Core, CoreConfig, Rings, Workspace};
+use crate::servo::{
+    Core, CoreConfig, Manipulator, Rings, SimulatedArm, Station, Trajectory, Workspace,
+};
 
 /// A workspace with a smaller radius is refused, m.
 const LEAST_RADIUS_M: f64 = 0.01;
@@ -30,6 +35,10 @@ pub struct RigOptions {
     pub control: ControlConfig,
     /// The state machine's settings.
     pub safety: SafetyConfig,
+    /// The arm is behind a driver: its dead time is its own and not simulated, and an engage begins at the setpoint it holds.
+    pub driver: bool,
+    /// A surface that the simulated tip may touch.
+    pub contact: Option<ContactPlane>,
 }
 
 /// Why there is no rig.
@@ -95,6 +104,7 @@ pub struct Rig {
     controller: Controller,
     plant: Plant,
     config: CoreConfig,
+    made_of: Arc<(String, String, RigOptions)>,
 }
 
 impl Rig {
@@ -103,20 +113,42 @@ impl Rig {
     /// # Errors
     /// [`RigError`].
     pub fn load(options: &RigOptions) -> Result<Self, RigError> {
-        let (urdf, text) = match &options.urdf {
-            None => ("the built-in arm".to_owned(), default_urdf().to_owned()),
-            Some(path) => {
-                let text = std::fs::read_to_string(path).map_err(|source| RigError::Io {
-                    path: path.clone(),
-                    source,
-                })?;
-                (path.display().to_string(), text)
-            }
+        let (urdf, text) = Self::text(options.urdf.as_deref())?;
+        Self::read(urdf, &text, options)
+    }
+
+    /// What an URDF is called, and its text; that of the built-in arm without a path.
+    ///
+    /// # Errors
+    /// [`RigError::Io`].
+    pub fn text(urdf: Option<&Path>) -> Result<(String, String), RigError> {
+        let Some(path) = urdf else {
+            return Ok(("the built-in arm".to_owned(), default_urdf().to_owned()));
         };
-        let arm = ArmModel::from_urdf(&text, &options.load).map_err(|source| RigError::Arm {
-            urdf: urdf.clone(),
+        let text = std::fs::read_to_string(path).map_err(|source| RigError::Io {
+            path: path.to_owned(),
             source,
         })?;
+        Ok((path.display().to_string(), text))
+    }
+
+    /// The arm alone, of the `text` of an URDF that is called `urdf`.
+    ///
+    /// # Errors
+    /// [`RigError::Arm`].
+    pub fn arm(urdf: &str, text: &str, options: &RigOptions) -> Result<ArmModel, RigError> {
+        ArmModel::from_urdf(text, &options.load).map_err(|source| RigError::Arm {
+            urdf: urdf.to_owned(),
+            source,
+        })
+    }
+
+    /// As [`Rig::load`], from the `text` of an URDF that is called `urdf`; `options.urdf` is not looked at.
+    ///
+    /// # Errors
+    /// [`RigError`].
+    pub fn read(urdf: String, text: &str, options: &RigOptions) -> Result<Self, RigError> {
+        let arm = Self::arm(&urdf, text, options)?;
         let home = match &options.start {
             None => home_posture(&arm),
             Some(q) => arm.posture(q).ok_or_else(|| RigError::Start {
@@ -125,12 +157,14 @@ impl Rig {
             })?,
         };
         let arm = Arc::new(arm);
+        let mut control = options.control;
+        if options.driver {
+            control.dead_time_s = 0.0;
+        }
         let controller =
-            Controller::new(arm.clone(), &options.control, &home).map_err(|source| {
-                RigError::Control {
-                    urdf: urdf.clone(),
-                    source,
-                }
+            Controller::new(arm.clone(), &control, &home).map_err(|source| RigError::Control {
+                urdf: urdf.clone(),
+                source,
             })?;
         let radius_m = workspace_radius(&arm, &home);
         if radius_m < LEAST_RADIUS_M {
@@ -143,17 +177,25 @@ impl Rig {
         let config = CoreConfig {
             safety: options.safety,
             tick_s: options.control.dt_s,
-            lag_s: controller.lag_s(),
+            lag_s: controller.lag_s() + options.control.dead_time_s - control.dead_time_s,
             workspace,
+            from_setpoint: options.driver,
         };
         Ok(Self {
-            plant: Plant::new(arm.clone(), &home)?,
+            plant: Plant::new(arm.clone(), &home)?.beside(options.contact),
             arm,
             home,
             workspace,
             controller,
             config,
+            made_of: Arc::new((urdf, text.to_owned(), options.clone())),
         })
+    }
+
+    /// What it was made of: what the URDF is called, its text, and the options.
+    pub fn made_of(&self) -> (&str, &str, &RigOptions) {
+        let (urdf, text, options) = &*self.made_of;
+        (urdf, text, options)
     }
 
     /// What the operator is told.
@@ -188,10 +230,22 @@ impl Rig {
                 .is_limited()
                 .then_some([joint.lower as f32, joint.upper as f32]),
         };
+        let capsule = |capsule: &telemime_sim::arm::Capsule| WireCapsule {
+            link: capsule.body as u8,
+            from: capsule.a.cast::<f32>().into(),
+            to: capsule.b.cast::<f32>().into(),
+            radius_m: capsule.radius_m as f32,
+        };
         WireArm {
             joints: self.arm.joints().iter().map(joint).collect(),
             tip: place(self.arm.tip_offset()),
-            capsules: capsules(&self.arm),
+            capsules: self
+                .arm
+                .capsules()
+                .iter()
+                .take(MAX_CAPSULES)
+                .map(capsule)
+                .collect(),
         }
     }
 
@@ -210,23 +264,30 @@ impl Rig {
         self.config.lag_s
     }
 
-    /// A servo at rest at the start posture.
-    pub fn servo(&self, rings: Rings) -> Core {
-        Core::new(
-            self.config,
-            self.controller.clone(),
-            self.plant.clone(),
-            Gripper::default(),
-            rings,
-        )
+    /// A core at rest at the start posture; what it no longer needs goes into `spent`.
+    pub fn core(&self, opening: f64, spent: rtrb::Producer<Arc<Trajectory>>) -> Core {
+        Core::new(self.config, self.controller.clone(), opening, spent)
+    }
+
+    /// A servo at rest at the start posture, before the simulated arm.
+    pub fn servo(&self, rings: Rings) -> Station {
+        let gripper = Gripper::default();
+        let opening = gripper.opening();
+        let arm = SimulatedArm::new(self.plant.clone(), gripper);
+        self.servo_before(Box::new(arm), opening, rings)
+    }
+
+    /// A servo at rest before `arm`, which is in the start posture and whose gripper is open as far as `opening`.
+    pub fn servo_before(&self, arm: Box<dyn Manipulator>, opening: f64, rings: Rings) -> Station {
+        let Rings {
+            orders,
+            reports,
+            spent,
+            brake,
+        } = rings;
+        Station::new(self.core(opening, spent), arm, orders, reports, brake)
     }
 }
-
-/// The first link is drawn this thick for an arm of a metre, m …
-const BASE_RADIUS: f64 = 0.05;
-
-/// … and the last one this much of it.
-const TAPER: f64 = 0.4;
 
 fn place(at: &Isometry3<f64>) -> WirePlace {
     let q = at.rotation.cast::<f32>();
@@ -236,37 +297,9 @@ fn place(at: &Isometry3<f64>) -> WirePlace {
     }
 }
 
-/// A capsule from every joint to the next, thinner towards the tip. The last ends short of the tip, so that it is seen.
-fn capsules(arm: &ArmModel) -> Vec<WireCapsule> {
-    let ways = arm.joints().iter().map(|joint| &joint.placement);
-    let ways: Vec<Vector3<f64>> = ways
-        .chain([arm.tip_offset()])
-        .map(|at| at.translation.vector)
-        .collect();
-    let last = ways.len() - 1;
-    let thickest = BASE_RADIUS * ways.iter().map(Vector3::norm).sum::<f64>().clamp(0.1, 3.0);
-    let link = |(i, way): (usize, &Vector3<f64>)| {
-        let radius = thickest * (1.0 - (1.0 - TAPER) * i as f64 / last.max(1) as f64);
-        let short = if i == last { radius + 0.015 } else { 0.0 };
-        let to = way * (1.0 - short / way.norm().max(1e-9)).max(0.0);
-        (to.norm() > 0.1 * radius).then(|| WireCapsule {
-            link: i as u8,
-            // The lowest stands on the floor, not in it.
-            from: if i == 0 {
-                (way * (radius / way.norm()).min(0.5)).cast::<f32>().into()
-            } else {
-                [0.0; 3]
-            },
-            to: to.cast::<f32>().into(),
-            radius_m: radius as f32,
-        })
-    };
-    ways.iter().enumerate().filter_map(link).collect()
-}
-
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Quaternion, Translation3, Unit, UnitQuaternion};
+    use nalgebra::{Quaternion, Translation3, Unit, UnitQuaternion, Vector3};
     use telemime_protocol::wire::v1::{Message, RobotControl};
     use telemime_sim::arm::Kinematics;
 

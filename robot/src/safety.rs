@@ -1,13 +1,14 @@
 //! The state machine of DESIGN §5, on the robot's own clock. It runs inside the servo tick: no thread,
 //! socket or estimate stands between it and the arm.
 
+use serde::{Deserialize, Serialize};
 use telemime_endpoint::Mono;
 use telemime_protocol::wire::v1::{Cause, RobotState};
 
 use crate::servo::Lease;
 
 /// What the state machine is set to.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SafetyConfig {
     /// Without news for this long the arm coasts, s. Above the operator's largest silence plus jitter.
     pub coast_after_s: f64,
@@ -25,7 +26,7 @@ impl Default for SafetyConfig {
 }
 
 /// State, cause and the two deadlines.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Safety {
     config: SafetyConfig,
     state: RobotState,
@@ -123,9 +124,9 @@ impl Safety {
     }
 
     /// Emergency stop, from any state, latched.
-    /// A stop at the robot takes over from one of the operator's: it asks for more.
+    /// A stop at the robot takes over from one of the operator's: it asks for more. The arm's own stays what it is.
     pub fn stop(&mut self, cause: Cause) {
-        let takes_over = cause == Cause::LocalStop && self.cause != Cause::LocalStop;
+        let takes_over = cause == Cause::LocalStop && self.cause == Cause::OperatorStop;
         if self.state != RobotState::Stopped || takes_over {
             self.enter(RobotState::Stopped, cause);
         }
@@ -136,7 +137,7 @@ impl Safety {
     pub fn reset(&mut self, operator_present: bool, stop: Option<u32>) {
         let meant = match stop {
             None => true,
-            Some(stop) => stop == self.transitions && self.cause != Cause::LocalStop,
+            Some(stop) => stop == self.transitions && self.cause == Cause::OperatorStop,
         };
         if self.state == RobotState::Stopped && meant {
             let next = if operator_present {

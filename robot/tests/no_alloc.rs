@@ -5,6 +5,7 @@
 )]
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
 use allocation_counter::measure;
 use nalgebra::{Matrix3, UnitQuaternion, Vector1, Vector3, Vector4};
@@ -17,9 +18,12 @@ use telemime_protocol::skill::example;
 use telemime_protocol::spline::{BSpline, End};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, RobotState};
+use telemime_robot::blackbox::{Header, Recorder, SPAN_S, taps};
+use telemime_robot::driver::{DriverArm, DriverConfig, Heard, Sent};
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo::{
-    Bent, Core, Engagement, Handle, Lease, Order, Report, Source, Ticket, Trajectory, rings,
+    ArmFault, ArmState, Bent, Engagement, Handle, Lease, Order, Report, Source, Station, Ticket,
+    Trajectory, rings,
 };
 
 const MS: i64 = 1_000_000;
@@ -29,11 +33,34 @@ fn ticket(number: u32) -> Ticket {
 }
 
 struct Bench {
-    core: Core,
+    core: Station,
     handle: Handle,
     now: Mono,
     seen: BTreeSet<String>,
     touched: u64,
+    recorder: Option<Recorder>,
+    driver: Option<Perfect>,
+}
+
+/// A driver whose arm is where it was told to be a tick ago.
+struct Perfect {
+    says: rtrb::Producer<Heard>,
+    hears: rtrb::Consumer<Sent>,
+}
+
+impl Perfect {
+    fn obey(&mut self, now: Mono) {
+        while let Ok(sent) = self.hears.pop() {
+            let reference = sent.setpoint.reference;
+            let state = ArmState {
+                q: reference.q,
+                qd: reference.qd,
+                opening: sent.setpoint.opening,
+            };
+            let (at, obeyed) = (now, sent.seq);
+            let _ = self.says.push(Heard::State { at, state, obeyed });
+        }
+    }
 }
 
 impl Bench {
@@ -46,7 +73,45 @@ impl Bench {
             now: Mono(0),
             seen: BTreeSet::new(),
             touched: 0,
+            recorder: None,
+            driver: None,
         }
+    }
+
+    /// The same arm behind a driver.
+    fn driven() -> Self {
+        let options = RigOptions {
+            driver: true,
+            ..RigOptions::default()
+        };
+        let rig = Rig::load(&options).unwrap();
+        let (says, heard) = rtrb::RingBuffer::new(64);
+        let (setpoints, hears) = rtrb::RingBuffer::new(64);
+        let state = ArmState {
+            q: rig.home,
+            opening: 1.0,
+            ..ArmState::default()
+        };
+        let config = DriverConfig {
+            rate_hz: 1000.0,
+            patience_s: 0.1,
+        };
+        let arm = DriverArm::new(rig.arm.clone(), config, state, heard, setpoints);
+        let (rings, handle) = rings();
+        Self {
+            core: rig.servo_before(Box::new(arm), 1.0, rings),
+            handle,
+            driver: Some(Perfect { says, hears }),
+            ..Self::new()
+        }
+    }
+
+    fn recorded(mut self) -> Self {
+        let rig = Rig::load(&RigOptions::default()).unwrap();
+        let (tap, feed) = taps(&self.core.room());
+        self.core = self.core.recorded(tap);
+        self.recorder = Some(Recorder::new(Header::new(&rig, None), feed, SPAN_S));
+        self
     }
 
     fn order(&mut self, order: Order) {
@@ -58,6 +123,16 @@ impl Bench {
         let mut last = None;
         for _ in 0..ms {
             self.now = Mono(self.now.0 + MS);
+            if let Some(driver) = &mut self.driver {
+                driver.obey(self.now);
+            }
+            if let Some(recorder) = self
+                .recorder
+                .as_mut()
+                .filter(|_| self.now.0 % (50 * MS) == 0)
+            {
+                recorder.drain();
+            }
             let (core, now) = (&mut self.core, self.now);
             let used = measure(|| last = Some(core.tick(now)));
             self.touched += used.count_total + used.count_current.unsigned_abs();
@@ -104,6 +179,7 @@ impl Bench {
     fn engage(&mut self, number: u32, source: Source) {
         self.order(Order::Engage(Engagement {
             ticket: ticket(number),
+            model: None,
             source,
             scale: 0.1,
             rotation: UnitQuaternion::identity(),
@@ -152,7 +228,7 @@ fn trajectory(duration_s: f64) -> Source {
         .map(|t| Vector4::new(1.0, 0.2 * t, 0.0, -0.1 * t))
         .collect();
     let grip: Vec<_> = t.iter().map(|t| Vector1::new(t / duration_s)).collect();
-    Source::Play(Box::new(Trajectory {
+    Source::Play(Arc::new(Trajectory {
         curve: PoseCurve {
             position: BSpline::interpolate(&t, &x, End::Natural).unwrap(),
             orientation: Some(BSpline::interpolate(&t, &q, End::Natural).unwrap()),
@@ -170,7 +246,43 @@ fn the_counter_counts() {
 
 #[test]
 fn a_tick_never_touches_the_heap() {
-    let mut bench = Bench::new();
+    through_every_state(Bench::new());
+}
+
+#[test]
+fn a_tick_that_is_recorded_does_not_either() {
+    through_every_state(Bench::new().recorded());
+}
+
+#[test]
+fn a_record_that_nobody_takes_costs_no_heap() {
+    let mut bench = Bench::new().recorded();
+    bench.recorder.as_mut().unwrap().drain();
+    let stalled = bench.recorder.take();
+    through_every_state(bench);
+    drop(stalled);
+}
+
+#[test]
+fn a_tick_before_a_driver_does_not_either() {
+    through_every_state(Bench::driven().recorded());
+}
+
+#[test]
+fn a_driver_that_fails_is_a_stop_without_the_heap() {
+    let mut bench = Bench::driven().recorded();
+    bench.tick(5);
+    bench.driver = None;
+    let stopped = bench.tick(200);
+    assert_eq!(
+        (stopped.state, stopped.cause),
+        (RobotState::Stopped, Cause::ArmFault)
+    );
+    assert!(matches!(stopped.fault, Some(ArmFault::Stalled { .. })));
+    assert_eq!(bench.touched, 0);
+}
+
+fn through_every_state(mut bench: Bench) {
     bench.tick(5);
     bench.order(Order::Operator(true));
     bench.tick(5);

@@ -4,6 +4,8 @@
     reason = "clippy.toml allows it in tests, but does not know these helpers for tests"
 )]
 
+use std::sync::Arc;
+
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
 use telemime_protocol::checkpoint::PoseCurve;
@@ -13,7 +15,7 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo::{
-    Bent, Core, Engagement, Handle, Lease, Order, Report, Source, Ticket, Trajectory, rings,
+    Bent, Engagement, Handle, Lease, Order, Report, Source, Station, Ticket, Trajectory, rings,
 };
 
 const MS: i64 = 1_000_000;
@@ -21,7 +23,7 @@ const MS: i64 = 1_000_000;
 const HAND_M: Vector3<f64> = Vector3::new(0.1, 0.2, 2.0);
 
 struct Bench {
-    core: Core,
+    core: Station,
     handle: Handle,
     now_ms: i64,
 }
@@ -75,6 +77,7 @@ impl Bench {
         let forecast = forecast();
         self.order(Order::Engage(Engagement {
             ticket: ticket(number),
+            model: None,
             source: Source::Mirror {
                 forecast,
                 valid_at,
@@ -101,7 +104,7 @@ impl Bench {
 }
 
 /// From rest half a metre along x and to rest again, within 2 s.
-fn half_a_metre() -> Box<Trajectory> {
+fn half_a_metre() -> Arc<Trajectory> {
     let t: Vec<f64> = (0..=20).map(|i| f64::from(i) * 0.1).collect();
     let x: Vec<_> = t
         .iter()
@@ -110,7 +113,7 @@ fn half_a_metre() -> Box<Trajectory> {
             HAND_M + Vector3::x() * (0.5 * u * u * (3.0 - 2.0 * u))
         })
         .collect();
-    Box::new(Trajectory {
+    Arc::new(Trajectory {
         curve: PoseCurve {
             position: BSpline::interpolate(&t, &x, End::Natural).unwrap(),
             orientation: None,
@@ -128,6 +131,7 @@ fn a_hand_bends_a_plan_by_its_weight_and_the_plan_waits_for_it() {
     let lease = bench.lease();
     bench.order(Order::Engage(Engagement {
         ticket: ticket(1),
+        model: None,
         source: Source::Play(trajectory),
         scale: 0.2,
         rotation: UnitQuaternion::identity(),

@@ -4,6 +4,8 @@
     reason = "clippy.toml allows it in tests, but does not know these helpers for tests"
 )]
 
+use std::sync::Arc;
+
 use nalgebra::{Quaternion, UnitQuaternion, Vector1, Vector3, Vector4};
 use telemime_endpoint::Mono;
 use telemime_protocol::checkpoint::PoseCurve;
@@ -16,7 +18,7 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo::{
-    Core, Engagement, Handle, Lease, Order, Report, Source, Ticket, Trajectory, rings,
+    Engagement, Handle, Lease, Order, Report, Source, Station, Ticket, Trajectory, rings,
 };
 
 const MS: i64 = 1_000_000;
@@ -29,7 +31,7 @@ fn rotation() -> UnitQuaternion<f64> {
 }
 
 struct Bench {
-    core: Core,
+    core: Station,
     handle: Handle,
     now: Mono,
 }
@@ -73,6 +75,7 @@ impl Bench {
         let lease = self.lease();
         self.order(Order::Engage(Engagement {
             ticket: TICKET,
+            model: None,
             source,
             scale: 0.1,
             rotation: rotation(),
@@ -312,7 +315,7 @@ fn a_plan_is_played_with_its_orientation_and_grip() {
         .collect();
     let grip: Vec<_> = t.iter().map(|&t| Vector1::new(1.0 - smooth(t))).collect();
     let mut bench = Bench::new();
-    let start = bench.engage(Source::Play(Box::new(Trajectory {
+    let start = bench.engage(Source::Play(Arc::new(Trajectory {
         curve: PoseCurve {
             position: BSpline::interpolate(&t, &x, End::Natural).unwrap(),
             orientation: Some(BSpline::interpolate(&t, &q, End::Natural).unwrap()),

@@ -39,7 +39,6 @@ async fn serve(args: &Args, page: SocketAddr, scratch: &Path) -> anyhow::Result<
     };
     let (shapes, shapes_rx) = watch::channel(None);
     let relay = Relay::bind(config, HostClock::new())
-        .await
         .context("no port for the relay")?
         .shaped_by(shapes_rx);
     let via = relay.local_addr()?;

@@ -170,9 +170,7 @@ pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> any
         down: args.link.down(),
         seed: args.link.shape.link_seed,
     };
-    let relay = Relay::bind(config, clock)
-        .await
-        .context("no port for the relay")?;
+    let relay = Relay::bind(config, clock).context("no port for the relay")?;
     let via = relay.local_addr()?;
     let (quit, quit_rx) = watch::channel(false);
     let relaying = tokio::spawn(async move {

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use nalgebra::Vector3;
 use telemime_operator::demonstration::Demonstration;
 use telemime_operator::session::SessionConfig;
 use telemime_operator::task::{Outcome, Recording, Task};
@@ -40,11 +41,16 @@ pub(super) struct Drive {
     pub(super) link: LinkConfig,
 }
 
-/// Ways to follow the hand, in the order of [`Driven::error_2`].
-pub(super) const WAYS: [&str; 4] = [
+/// A hand this far from where it rested has begun to move, m: more than a tracker errs by.
+const BEGUN_M: f64 = 0.02;
+
+/// Ways to follow the hand, in the order of [`Driven::error_2`]. The last but one knows everything from when the hand, seen over
+/// the link, has begun to move: nobody who begins nothing by himself can be better.
+pub(super) const WAYS: [&str; 5] = [
     "delayed, ideal tip",
     "delayed, same arm",
     "guarded, same arm",
+    "once begun, same arm",
     "known ahead, same arm",
 ];
 
@@ -54,9 +60,9 @@ pub(super) struct Driven {
     /// Moments judged, 1 ms apart.
     pub(super) moments: usize,
     /// Σ of squared distances from the hand, in its metres, of each of [`WAYS`], m².
-    pub(super) error_2: [f64; 4],
+    pub(super) error_2: [f64; WAYS.len()],
     /// How late, s; `None` if it may be more than was tried.
-    pub(super) lag_s: [Option<f64>; 4],
+    pub(super) lag_s: [Option<f64>; WAYS.len()],
     pub(super) scale: f64,
     /// Ticks on which a limit acted.
     pub(super) clamps: u32,
@@ -164,13 +170,25 @@ fn judge(
     let rig = &drive.rig;
     let begin_s = tip.span_s().0.min(0.0);
     let delayed = follow(rig, mapping, begin_s, end_s, |t| Some(Hand::from(held(t))));
-    let known = follow(rig, mapping, begin_s, end_s, |t| {
-        Some(Hand::from(truth.at(t + rig.lag_s())))
-    });
+    let away = |(_, x): &&(f64, Vector3<f64>)| (x - start).norm() > BEGUN_M;
+    let begun = truth.points().iter().find(away);
+    let seen_s = begun.map_or(end_s, |(t_s, _)| t_s + drive.link.delay_s);
+    let known = |from_s: f64| {
+        follow(rig, mapping, begin_s, end_s, |t| {
+            let knows = t >= from_s;
+            Some(Hand::from(if knows {
+                truth.at(t + rig.lag_s())
+            } else {
+                start
+            }))
+        })
+    };
+    let (once_begun, known) = (known(seen_s), known(f64::NEG_INFINITY));
     let ways = [
         ideal.ok(),
         Some(delayed.tip),
         Some(tip.clone()),
+        Some(once_begun.tip),
         Some(known.tip),
     ];
     let coarse: Vec<f64> = grid_s.iter().copied().step_by(LAG_GRID).collect();

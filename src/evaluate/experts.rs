@@ -89,7 +89,7 @@ pub(super) const PLACE_NAMES: [&str; 9] = [
     "Kalman",
     "clock-indexed GMR",
     "mixture alone",
-    "guard, rest unseen",
+    "guard alone",
     GUARDED,
 ];
 
@@ -101,7 +101,7 @@ pub(super) const TURN_NAMES: [&str; 8] = [
     "generic",
     "clock-indexed GMR",
     "mixture alone",
-    "guard, rest unseen",
+    "guard alone",
     GUARDED,
 ];
 
@@ -133,7 +133,7 @@ pub(super) fn experts(
         hand: None,
         posterior: None,
     }));
-    all.push(Box::new(Unrested::new(side, skill)));
+    all.push(Box::new(Guard::new(side, skill)));
     all.push(Box::new(Guarded::new(side, skill, session)));
     all
 }
@@ -333,9 +333,8 @@ impl Expert for Mixture {
     }
 }
 
-/// The session's guard on a hand of which nobody says that it has rested: what it costs not to begin motion that
-/// the person has not begun.
-struct Unrested {
+/// The session's guard and nothing else of the session: what rounding and the glitch gate cost is the difference.
+struct Guard {
     side: Side,
     skill: Arc<Skill>,
     hand: Option<Hand>,
@@ -344,7 +343,7 @@ struct Unrested {
     ahead: Option<Ahead>,
 }
 
-impl Unrested {
+impl Guard {
     fn new(side: Side, skill: &Arc<Skill>) -> Self {
         let turns = skill
             .turn()
@@ -361,7 +360,7 @@ impl Unrested {
     }
 }
 
-impl Expert for Unrested {
+impl Expert for Guard {
     fn take(&mut self, sample: &Sample) {
         let before = self.hand;
         let hand = Hand::take(&mut self.hand, sample);

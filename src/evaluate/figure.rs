@@ -49,7 +49,7 @@ pub(super) fn colour(name: &str) -> RGBColor {
         "Kalman" => SILVER,
         "clock-indexed GMR" => GREY,
         "mixture alone" => GREEN,
-        "guard, rest unseen" => SKY,
+        "guard alone" => SKY,
         _ => BLUE,
     }
 }

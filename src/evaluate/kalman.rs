@@ -14,7 +14,7 @@ const CHOSEN_AT_S: f64 = 0.1;
 /// Position, velocity and acceleration of each axis; the axes share one covariance, in units of the
 /// measurement's.
 #[derive(Debug, Clone)]
-pub(super) struct Kalman {
+pub(crate) struct Kalman {
     ratio: f64,
     t_s: Option<f64>,
     /// Rows: position (m), velocity (m/s), acceleration (m/s²); a column an axis.
@@ -35,7 +35,7 @@ impl Kalman {
     }
 
     /// The filter that predicts these demonstrations best 100 ms ahead.
-    pub(super) fn tuned(demonstrations: &[Demonstration]) -> Self {
+    pub(crate) fn tuned(demonstrations: &[Demonstration]) -> Self {
         let error = |ratio: f64| -> f64 {
             let each = demonstrations.iter().map(|d| {
                 let mut filter = Self::new(ratio);
@@ -54,6 +54,12 @@ impl Kalman {
             .map(|ratio| (error(ratio), ratio))
             .min_by(|a, b| a.0.total_cmp(&b.0));
         Self::new(best.map_or(1e8, |(_, ratio)| ratio))
+    }
+
+    /// Takes the next sample; position (m), velocity (m/s) and acceleration (m/s²) as the filter then has them.
+    pub(crate) fn take_motion(&mut self, sample: &Sample) -> [Vector3<f64>; 3] {
+        self.take(sample);
+        [0, 1, 2].map(|row| self.state.row(row).transpose())
     }
 
     fn transition(dt_s: f64) -> Matrix3<f64> {

@@ -24,7 +24,7 @@ const REST_S: f64 = 1.0 / 30.0;
 const EPOCH: u32 = 1;
 
 /// A session that mirrors one performance.
-pub(super) struct Live {
+pub(crate) struct Live {
     session: Session,
     skill: Arc<Skill>,
     delay_s: f64,
@@ -33,22 +33,22 @@ pub(super) struct Live {
 }
 
 /// One motion message.
-pub(super) struct Said {
+pub(crate) struct Said {
     /// When, s of the recording.
-    pub(super) at_s: f64,
+    pub(crate) at_s: f64,
     /// The datagram's length, bytes.
-    pub(super) bytes: usize,
+    pub(crate) bytes: usize,
     /// Numbers of the knots it carries.
-    pub(super) knots: std::ops::Range<u32>,
+    pub(crate) knots: std::ops::Range<u32>,
     /// What the robot predicts from it.
-    pub(super) place: Forecast,
+    pub(crate) place: Forecast,
     /// The same of the orientation, where the recording has it.
-    pub(super) turn: Option<TurnForecast>,
+    pub(crate) turn: Option<TurnForecast>,
 }
 
 impl Live {
     /// A session with a robot `delay_s` away, whose arm adds no lag.
-    pub(super) fn new(skill: &Arc<Skill>, config: SessionConfig, delay_s: f64) -> Self {
+    pub(crate) fn new(skill: &Arc<Skill>, config: SessionConfig, delay_s: f64) -> Self {
         let mut live = Self {
             session: Session::new(config, Some(Arc::clone(skill)), EPOCH),
             skill: Arc::clone(skill),
@@ -80,7 +80,7 @@ impl Live {
     }
 
     /// The robot's news: how long messages take, and the knots it has.
-    pub(super) fn telemetry(&mut self, at_s: f64, path_frontier: u32) {
+    pub(crate) fn telemetry(&mut self, at_s: f64, path_frontier: u32) {
         self.acknowledged += 1;
         let telemetry = RobotDatagram::Telemetry(Telemetry {
             epoch: EPOCH,
@@ -109,7 +109,7 @@ impl Live {
     }
 
     /// Takes a sample the moment it is valid; what the session then says, in order.
-    pub(super) fn take(&mut self, sample: &Sample) -> Vec<Said> {
+    pub(crate) fn take(&mut self, sample: &Sample) -> Vec<Said> {
         if !self.begun {
             self.begun = true;
             let rest = Sample {
@@ -141,7 +141,7 @@ impl Live {
     }
 
     /// What the session has to say before `until_s` though no sample comes.
-    pub(super) fn wait(&mut self, until_s: f64) -> Vec<Said> {
+    pub(crate) fn wait(&mut self, until_s: f64) -> Vec<Said> {
         let mut all = Vec::new();
         while let Some((due, _)) = self.session.poll_timeout() {
             let due_s = due.secs_since(ZERO);
@@ -190,6 +190,6 @@ impl Live {
 }
 
 /// The session's time of a recording's.
-pub(super) fn on_session_clock(t_s: f64) -> Stamp {
+pub(crate) fn on_session_clock(t_s: f64) -> Stamp {
     ZERO.offset_by_secs(t_s)
 }

@@ -26,6 +26,8 @@ use telemime_robot::rig::{Rig, RigOptions};
 
 use crate::cli::Shape;
 use arm::Drive;
+pub(crate) use kalman::Kalman;
+pub(crate) use live::{Live, on_session_clock};
 use dual::Scheme;
 use protocol::{Plan, Protocol};
 

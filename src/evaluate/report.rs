@@ -156,6 +156,8 @@ pub(super) struct Arm {
     pub(super) of_groups: Vec<[Option<f64>; 2]>,
     /// Share of the delay's cost that is gone, over all moments.
     pub(super) fraction_hidden: Option<f64>,
+    /// The same of what could be gone without foreseeing that the hand begins to move.
+    pub(super) fraction_hidden_once_begun: Option<f64>,
     /// Share of the performances whose lag is within 10 ms.
     pub(super) lag_within_10_ms: f64,
     pub(super) messages_per_s: f64,
@@ -358,7 +360,7 @@ fn arm(plan: &Plan<'_>, performances: &[Performance]) -> Option<Arm> {
     };
     let moments: usize = driven.iter().map(|(_, one)| one.moments).sum();
     let rmse = |way: usize| finite((error_2(way, None) / moments as f64).sqrt());
-    let [ideal, delayed, own, known] = [0, 1, 2, 3];
+    let [ideal, delayed, own, begun, known] = std::array::from_fn(|way| way);
     let of_groups: Vec<[Option<f64>; 2]> = (0..plan.sets.len())
         .map(|set| {
             let over = |way| finite((error_2(own, Some(set)) / error_2(way, Some(set))).sqrt());
@@ -394,6 +396,10 @@ fn arm(plan: &Plan<'_>, performances: &[Performance]) -> Option<Arm> {
     });
     let clamps: f64 = driven.iter().map(|(_, one)| f64::from(one.clamps)).sum();
     let jerk_2 = |n: usize| -> f64 { driven.iter().map(|(_, one)| one.jerk_2[n]).sum() };
+    let hidden = |floor: usize| {
+        let gone = rmse(delayed)? - rmse(own)?;
+        finite(gone / (rmse(delayed)? - rmse(floor)?))
+    };
     (!driven.is_empty()).then(|| Arm {
         driven: driven.len(),
         scale: [
@@ -404,10 +410,8 @@ fn arm(plan: &Plan<'_>, performances: &[Performance]) -> Option<Arm> {
         over_delayed_ideal,
         over_delayed_same_arm,
         of_groups,
-        fraction_hidden: rmse(delayed)
-            .zip(rmse(own))
-            .zip(rmse(known))
-            .and_then(|((delayed, own), known)| finite((delayed - own) / (delayed - known))),
+        fraction_hidden: hidden(known),
+        fraction_hidden_once_begun: hidden(begun),
         lag_within_10_ms: within as f64 / driven.len() as f64,
         messages_per_s: messages / seconds,
         jerk: finite((jerk_2(0) / jerk_2(1)).sqrt()),

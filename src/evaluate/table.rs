@@ -263,11 +263,12 @@ fn arm(out: &mut String, report: &Report) {
     }
     let _ = writeln!(
         out,
-        "{} over delayed, same arm; {} over delayed, ideal tip; fraction hidden {}; lag within 10 ms in {:.0} %\n\
+        "{} over delayed, same arm; {} over delayed, ideal tip; fraction hidden {}, {} of what is left once it has begun; lag within 10 ms in {:.0} %\n\
          {:.1} messages/s; jerk of the command over the hand's {}; a limit acted on {:.1} % of the ticks",
         number(arm.over_delayed_same_arm, 3),
         number(arm.over_delayed_ideal, 3),
         number(arm.fraction_hidden, 3),
+        number(arm.fraction_hidden_once_begun, 3),
         100.0 * arm.lag_within_10_ms,
         arm.messages_per_s,
         number(arm.jerk, 2),

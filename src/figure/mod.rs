@@ -111,6 +111,14 @@ pub(crate) enum FigureError {
 }
 
 impl Figure {
+    /// The page as SVG.
+    ///
+    /// # Errors
+    /// [`FigureError`].
+    pub(crate) fn svg(&self) -> Result<String, FigureError> {
+        draw::svg(self)
+    }
+
     /// Draws the page into the file, SVG or PNG (at two pixels per unit) by its ending.
     ///
     /// # Errors

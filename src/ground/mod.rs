@@ -3,6 +3,8 @@
 
 mod net;
 mod pair;
+mod tap;
 
-pub use net::{Network, Socket};
+pub use net::{Network, Passage, Socket};
 pub use pair::{Operator, Pair, PairError, Robot, run_virtual};
+pub use tap::{Told, Watcher};

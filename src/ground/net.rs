@@ -29,7 +29,24 @@ struct State {
     links: BTreeMap<(SocketAddr, SocketAddr), Link>,
     down: bool,
     sockets: u64,
+    under_way: usize,
     tape: Option<Vec<Taped>>,
+    log: Option<Vec<Passage>>,
+}
+
+/// What became of one packet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Passage {
+    /// Who sent it.
+    pub from: SocketAddr,
+    /// Who was to receive it.
+    pub to: SocketAddr,
+    /// When it was sent, on tokio's clock.
+    pub sent: Instant,
+    /// Its length, IP and UDP headers included.
+    pub len_bytes: usize,
+    /// When it arrives; `None` if it does not.
+    pub arrives: Option<Instant>,
 }
 
 /// A packet that somebody on the way has kept.
@@ -58,7 +75,9 @@ impl Network {
             links: BTreeMap::new(),
             down: false,
             sockets: 0,
+            under_way: 0,
             tape: None,
+            log: None,
         })))
     }
 
@@ -98,6 +117,16 @@ impl Network {
         self.state().down = down;
     }
 
+    /// From now on keeps count of every packet that is sent.
+    pub fn log(&self) {
+        self.state().log = Some(Vec::new());
+    }
+
+    /// Every packet sent since [`Network::log`], in order; the count ends.
+    pub fn logged(&self) -> Vec<Passage> {
+        self.state().log.take().unwrap_or_default()
+    }
+
     /// From now on keeps a copy of every packet that is delivered.
     pub fn record(&self) {
         self.state().tape = Some(Vec::new());
@@ -111,6 +140,18 @@ impl Network {
             self.deliver(from, to, packet);
         }
         count
+    }
+
+    /// Delivers a packet that nobody has sent, as if it came from `from`.
+    pub fn forge(&self, from: SocketAddr, to: SocketAddr, packet: Vec<u8>) {
+        self.deliver(from, to, packet);
+    }
+
+    /// Packets on their way, and those that nobody has read yet.
+    pub fn queued(&self) -> (usize, usize) {
+        let state = self.state();
+        let unread = state.inboxes.values().map(|inbox| inbox.packets.len());
+        (state.under_way, unread.sum())
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
@@ -131,10 +172,20 @@ impl Network {
             Some(link) => link.send(now_ns, len),
             None => Fate::whole(now_ns),
         };
-        if state.down {
+        let (epoch, down) = (state.epoch, state.down);
+        let at = |ns: i64| epoch + Duration::from_nanos(ns.max(0) as u64);
+        if let Some(log) = &mut state.log {
+            log.push(Passage {
+                from,
+                to,
+                sent: Instant::now(),
+                len_bytes: len,
+                arrives: fate.arrival_ns().filter(|_| !down).map(at),
+            });
+        }
+        if down {
             return;
         }
-        let epoch = state.epoch;
         drop(state);
         for delivery in fate.deliveries() {
             let (network, mut packet) = (self.clone(), packet.to_vec());
@@ -143,9 +194,11 @@ impl Network {
             {
                 continue;
             }
-            let at = epoch + Duration::from_nanos(delivery.at_ns.max(0) as u64);
+            let at = at(delivery.at_ns);
+            self.state().under_way += 1;
             tokio::spawn(async move {
                 sleep_until(at).await;
+                network.state().under_way -= 1;
                 network.deliver(from, to, packet);
             });
         }
@@ -172,6 +225,20 @@ pub struct Socket {
     network: Network,
     addr: SocketAddr,
     id: u64,
+}
+
+impl Drop for Socket {
+    /// What is sent to a socket that is closed piles up nowhere.
+    fn drop(&mut self) {
+        let mut state = self.network.state();
+        if state
+            .inboxes
+            .get(&self.addr)
+            .is_some_and(|i| i.id == self.id)
+        {
+            state.inboxes.remove(&self.addr);
+        }
+    }
 }
 
 impl fmt::Debug for Socket {

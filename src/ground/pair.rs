@@ -21,16 +21,18 @@ use telemime_operator::session::SessionConfig;
 use telemime_operator::task::Task;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
+use telemime_robot::blackbox::{Due, Header, Recorder, SPAN_S, taps};
 use telemime_robot::daemon::{Daemon as RobotDaemon, Notice as RobotNotice};
 use telemime_robot::desk::Desk;
 use telemime_robot::rig::Rig;
-use telemime_robot::servo::{self, Report};
+use telemime_robot::servo::Report;
 use telemime_robot::session::SessionConfig as RobotConfig;
 use telemime_sim::link::LinkConfig;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::net::Network;
+use super::tap::{Watched, Watcher};
 
 /// Why a pair could not run.
 #[derive(Debug, thiserror::Error)]
@@ -56,6 +58,26 @@ fn host(n: u8) -> SocketAddr {
     SocketAddr::new(IpAddr::V4(Ipv4Addr::new(192, 0, 2, n)), 4433)
 }
 
+/// The key whose 32 bytes are all `n` (RFC 8410 §7): a certificate's length depends on its key, and on a thin link
+/// every byte shows. Nothing but this ground ever trusts it.
+fn identity(n: u8) -> Result<Identity, IdentityError> {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut der = vec![
+        0x30, 0x2e, 2, 1, 0, 0x30, 5, 6, 3, 0x2b, 0x65, 0x70, 4, 0x22, 4, 0x20,
+    ];
+    der.extend([n; 32]);
+    let base64: String = der
+        .chunks_exact(3)
+        .flat_map(|b| {
+            let bits = u32::from(b[0]) << 16 | u32::from(b[1]) << 8 | u32::from(b[2]);
+            [18, 12, 6, 0].map(|shift| char::from(DIGITS[(bits >> shift) as usize & 63]))
+        })
+        .collect();
+    Identity::from_pem(&format!(
+        "-----BEGIN PRIVATE KEY-----\n{base64}\n-----END PRIVATE KEY-----\n"
+    ))
+}
+
 /// Runs `scenario` on a single thread under a paused clock.
 ///
 /// # Errors
@@ -79,6 +101,7 @@ pub struct Pair {
     clock: HostClock,
     config: RobotConfig,
     external: Option<(External, External)>,
+    watcher: Option<Watcher>,
     robot_identity: Identity,
     operator_identity: Identity,
     operators: u8,
@@ -91,8 +114,10 @@ pub struct Pair {
 pub struct Robot {
     reports: Rc<RefCell<Vec<Report>>>,
     notices: Rc<RefCell<Vec<RobotNotice>>>,
+    records: Rc<RefCell<Vec<(Due, Vec<u8>)>>>,
     quit: watch::Sender<bool>,
     words: mpsc::UnboundedSender<Word>,
+    endpoint: quinn::Endpoint,
     tasks: Rc<[tokio::task::AbortHandle; 2]>,
 }
 
@@ -113,21 +138,39 @@ impl Robot {
     fn start(
         network: &Network,
         clock: HostClock,
-        rig: &Rig,
+        (rig, recorded): (&Rig, bool),
         identity: &Identity,
         trust: &Trust,
         config: RobotConfig,
-        external: Option<External>,
+        (external, watcher): (Option<External>, Option<Watcher>),
     ) -> Result<Self, PairError> {
-        let (rings, handle) = servo::rings();
-        let mut core = rig.servo(rings);
-        let period = Duration::from_secs_f64(core.tick_s());
+        let mut recorder = None;
+        let make = |rings| {
+            let station = rig.servo(rings);
+            if !recorded {
+                return station;
+            }
+            let (tap, feed) = taps(&station.room());
+            recorder = Some(Recorder::new(Header::new(rig, None), feed, SPAN_S));
+            station.recorded(tap)
+        };
+        let (mut station, handle) = Watched::new(make, clock, watcher);
+        let records: Rc<RefCell<Vec<_>>> = Rc::default();
+        let kept = records.clone();
+        let period = Duration::from_secs_f64(station.tick_s());
         let servo = tokio::task::spawn_local(async move {
             let mut tick = interval(period);
             tick.set_missed_tick_behavior(MissedTickBehavior::Burst);
             loop {
                 tick.tick().await;
-                core.tick(clock.now());
+                let report = station.tick();
+                // As often as the thread does it that a robot has for this.
+                if let Some(recorder) = recorder.as_mut().filter(|_| report.tick % 50 == 0)
+                    && let Some(due) = recorder.drain()
+                    && let Some(bytes) = recorder.bytes(due)
+                {
+                    kept.borrow_mut().push((due, bytes));
+                }
             }
         });
         let socket = quic::Socket::Abstract {
@@ -135,6 +178,7 @@ impl Robot {
             seed: [1; 32],
         };
         let endpoint = quic::server(identity, trust, socket, &Meter::default())?;
+        let connections = endpoint.clone();
         let own = Own {
             name: Name::made_of("virtual-robot"),
             key: identity.fingerprint(),
@@ -150,8 +194,10 @@ impl Robot {
         let robot = Self {
             reports: Rc::default(),
             notices: Rc::default(),
+            records,
             quit,
             words,
+            endpoint: connections,
             tasks: Rc::new([servo.abort_handle(), serving.abort_handle()]),
         };
         let log = robot.clone();
@@ -177,9 +223,25 @@ impl Robot {
         self.reports.borrow()
     }
 
+    /// What its black box has written so far, if the pair was [started with one](Pair::start_recorded).
+    pub fn records(&self) -> std::cell::Ref<'_, Vec<(Due, Vec<u8>)>> {
+        self.records.borrow()
+    }
+
     /// Everything else it noticed so far.
     pub fn notices(&self) -> std::cell::Ref<'_, Vec<RobotNotice>> {
         self.notices.borrow()
+    }
+
+    /// Forgets every tick and notice so far, and returns the notices: hours do not fit into memory.
+    pub fn forget(&self) -> Vec<RobotNotice> {
+        self.reports.borrow_mut().clear();
+        self.notices.take()
+    }
+
+    /// Connections its endpoint keeps anything of.
+    pub fn connections(&self) -> usize {
+        self.endpoint.open_connections()
     }
 
     /// A word at the robot's own terminal.
@@ -213,6 +275,11 @@ impl Operator {
         Ok(self.endpoint.rebind_abstract(socket)?)
     }
 
+    /// Connections its endpoint keeps anything of.
+    pub fn connections(&self) -> usize {
+        self.endpoint.open_connections()
+    }
+
     /// A word at the operator's own terminal.
     pub fn say(&self, word: Word) {
         // The daemon has ended if nobody hears it.
@@ -239,7 +306,15 @@ impl Pair {
     /// # Errors
     /// [`PairError`].
     pub fn start_with(rig: &Rig, config: RobotConfig) -> Result<Self, PairError> {
-        Self::start_as(rig, config, None)
+        Self::start_as((rig, false), config, None, None)
+    }
+
+    /// As [`Pair::start`], with a black box at the robot.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn start_recorded(rig: &Rig) -> Result<Self, PairError> {
+        Self::start_as((rig, true), Default::default(), None, None)
     }
 
     /// As [`Pair::start`], with disciplined clocks at the robot and at the operators.
@@ -251,18 +326,36 @@ impl Pair {
         robot: External,
         operators: External,
     ) -> Result<Self, PairError> {
-        Self::start_as(rig, Default::default(), Some((robot, operators)))
+        Self::start_as(
+            (rig, false),
+            Default::default(),
+            Some((robot, operators)),
+            None,
+        )
+    }
+
+    /// As [`Pair::start`], under the eyes of `watcher`; with disciplined clocks, the robot's and the operators', if there
+    /// are any.
+    ///
+    /// # Errors
+    /// [`PairError`].
+    pub fn start_watched(
+        rig: &Rig,
+        watcher: Watcher,
+        external: Option<(External, External)>,
+    ) -> Result<Self, PairError> {
+        Self::start_as((rig, false), Default::default(), external, Some(watcher))
     }
 
     fn start_as(
-        rig: &Rig,
+        rig: (&Rig, bool),
         config: RobotConfig,
         external: Option<(External, External)>,
+        watcher: Option<Watcher>,
     ) -> Result<Self, PairError> {
         let network = Network::new();
         let clock = HostClock::from_zero();
-        let robot_identity = Identity::ephemeral()?;
-        let operator_identity = Identity::ephemeral()?;
+        let [robot_identity, operator_identity] = [identity(1)?, identity(2)?];
         let trust = Trust::new([operator_identity.fingerprint()]);
         let robots = external.as_ref().map(|(robot, _)| robot.clone());
         let robot = Robot::start(
@@ -272,7 +365,7 @@ impl Pair {
             &robot_identity,
             &trust,
             config,
-            robots,
+            (robots, watcher.clone()),
         )?;
         Ok(Self {
             network,
@@ -281,6 +374,7 @@ impl Pair {
             clock,
             config,
             external,
+            watcher,
             robot_identity,
             operator_identity,
             operators: 0,
@@ -301,11 +395,11 @@ impl Pair {
         self.robot = Robot::start(
             network,
             clock,
-            rig,
+            (rig, false),
             identity,
             &self.trust,
             self.config,
-            external,
+            (external, self.watcher.clone()),
         )?;
         Ok(())
     }
@@ -313,6 +407,11 @@ impl Pair {
     /// Now on the common clock.
     pub fn now(&self) -> Mono {
         self.clock.now()
+    }
+
+    /// The common clock itself.
+    pub fn clock(&self) -> HostClock {
+        self.clock
     }
 
     /// When, on the common clock, the operators' session clock shows `stamp`.

@@ -17,6 +17,8 @@ pub struct Follow {
     pub turn: Option<Turns>,
     /// Ticks on which a limit acted.
     pub clamps: u32,
+    /// The same tick by tick, and how the tip's reference jerked, m/s³.
+    pub strain: Vec<(bool, f64)>,
 }
 
 /// A hand to follow.
@@ -51,7 +53,8 @@ pub fn follow(
         ..*mapping
     };
     let (mut points, mut turns) = (Vec::new(), Vec::new());
-    let mut clamps = 0;
+    let mut strained = Vec::new();
+    let mut acceleration = Vector3::zeros();
     let ticks = ((to_s - from_s) / tick_s).ceil().max(1.0) as u64;
     for tick in 0..ticks {
         let since_s = tick as f64 * tick_s;
@@ -71,9 +74,11 @@ pub fn follow(
             plant.qd(),
         );
         let strain = plant.step(&output.tau, tick_s);
-        clamps += u32::from(
-            out_of_reach || output.clamps != Default::default() || strain != Default::default(),
-        );
+        let limited =
+            out_of_reach || output.clamps != Default::default() || strain != Default::default();
+        let jerk_m_s3 = (output.reference.a - acceleration).norm() / tick_s;
+        acceleration = output.reference.a;
+        strained.push((limited, jerk_m_s3));
         points.push((from_s + since_s, mapping.unplace(output.tip)));
         if let Some(q) = mapping.unorient(&output.orientation) {
             turns.push((from_s + since_s, q));
@@ -83,6 +88,7 @@ pub fn follow(
     Follow {
         tip,
         turn: Turns::new(turns),
-        clamps,
+        clamps: strained.iter().filter(|(limited, _)| *limited).count() as u32,
+        strain: strained,
     }
 }

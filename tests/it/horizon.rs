@@ -160,7 +160,7 @@ fn a_sensors_latency_is_made_up_for_once_it_is_known() {
 fn what_moves_the_arm_is_as_smooth_as_the_hand() {
     let hand = Track::new(unseen()).unwrap();
     let mut found = Vec::new();
-    for omega in [30.0, 36.0, 45.0, 60.0] {
+    for omega in [30.0, 36.0, 40.0, 45.0, 60.0] {
         let rig = rig(0.0, omega);
         let run = once(&rig, SessionConfig::default(), &unseen());
         let (error_m, lag_s) = judged(&run.tip, 0.0, &hand, run.from_s);

@@ -6,10 +6,12 @@
 
 mod alignment;
 mod arms;
+mod blackbox;
 mod codec;
 mod commands;
 mod correct;
 mod data;
+mod driver;
 mod evaluate;
 mod floods;
 mod frames;
@@ -20,6 +22,7 @@ mod interop;
 mod layout;
 mod link;
 mod mirror;
+mod overhead;
 mod pairing;
 mod paper;
 mod picture;
@@ -33,6 +36,7 @@ mod refinement;
 mod safety;
 mod scene;
 mod selection;
+mod soak;
 mod strangers;
 mod tap;
 mod versions;

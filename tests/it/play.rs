@@ -15,7 +15,7 @@ use crate::scene::{delayed, rig, shaped, skill};
 const BOUND_M: f64 = 0.01;
 
 /// The skill's motion, inferred every 10 ms, and its checkpoints.
-fn inferred(skill: &Skill) -> (Vec<f64>, Vec<Vector3<f64>>, Plan<3>) {
+pub(crate) fn inferred(skill: &Skill) -> (Vec<f64>, Vec<Vector3<f64>>, Plan<3>) {
     let gmr = Gmr::<1, 3>::new(skill.motion()).unwrap();
     let steps = (skill.duration_s() * 100.0) as usize;
     let t: Vec<f64> = (0..=steps).map(|i| i as f64 * 0.01).collect();

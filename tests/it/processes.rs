@@ -20,13 +20,13 @@ const PATIENCE: Duration = Duration::from_secs(120);
 /// These run in real time: one after the other, so that they do not take each other's.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
-fn alone() -> MutexGuard<'static, ()> {
+pub(crate) fn alone() -> MutexGuard<'static, ()> {
     // A test that failed has nothing left running that matters here.
     ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// A process of ours, with what it prints.
-struct Process {
+pub(crate) struct Process {
     child: Child,
     lines: Receiver<String>,
     errors: Receiver<String>,
@@ -45,7 +45,7 @@ fn lines(source: impl std::io::Read + Send + 'static) -> Receiver<String> {
 }
 
 impl Process {
-    fn start(args: &[&str]) -> Self {
+    pub(crate) fn start(args: &[&str]) -> Self {
         let mut child = Command::new(env!("CARGO_BIN_EXE_telemime"))
             .args(args)
             .stdin(Stdio::piped())
@@ -63,11 +63,11 @@ impl Process {
     }
 
     /// The next event of this kind.
-    fn event(&self, kind: &str) -> Value {
+    pub(crate) fn event(&self, kind: &str) -> Value {
         self.event_where(kind, |_| true)
     }
 
-    fn event_where(&self, kind: &str, wanted: impl Fn(&Value) -> bool) -> Value {
+    pub(crate) fn event_where(&self, kind: &str, wanted: impl Fn(&Value) -> bool) -> Value {
         loop {
             let line = self.lines.recv_timeout(PATIENCE).unwrap_or_else(|e| {
                 let said: Vec<_> = self.errors.try_iter().collect();
@@ -81,17 +81,17 @@ impl Process {
     }
 
     /// Types a line at its terminal.
-    fn types(&mut self, line: &str) {
+    pub(crate) fn types(&mut self, line: &str) {
         let stdin = self.child.stdin.as_mut().unwrap();
         writeln!(stdin, "{line}").unwrap();
     }
 
-    fn signal(&self, signal: Signal) {
+    pub(crate) fn signal(&self, signal: Signal) {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
 
     /// Waits for the end; what it then had said on stderr.
-    fn end(mut self) -> (ExitStatus, String) {
+    pub(crate) fn end(mut self) -> (ExitStatus, String) {
         let (tx, rx) = channel();
         let lines = self.lines;
         // The pipe closes when the process ends, and that wakes the reader.
@@ -109,12 +109,12 @@ impl Process {
 }
 
 /// Keys, configurations and recordings in a folder of their own.
-struct Stage {
+pub(crate) struct Stage {
     dir: tempfile::TempDir,
 }
 
 impl Stage {
-    fn new() -> Self {
+    pub(crate) fn new() -> Self {
         let stage = Self {
             dir: tempfile::tempdir().unwrap(),
         };
@@ -129,11 +129,11 @@ impl Stage {
         stage
     }
 
-    fn path(&self, name: &str) -> PathBuf {
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
         self.dir.path().join(name)
     }
 
-    fn text(&self, name: &str) -> String {
+    pub(crate) fn text(&self, name: &str) -> String {
         self.path(name).to_str().unwrap().to_owned()
     }
 
@@ -149,7 +149,7 @@ impl Stage {
         std::fs::write(path, text).unwrap();
     }
 
-    fn fingerprint(&self, who: &str) -> String {
+    pub(crate) fn fingerprint(&self, who: &str) -> String {
         Identity::load_or_create(&self.path(&format!("{who}.key")))
             .unwrap()
             .fingerprint()
@@ -157,27 +157,28 @@ impl Stage {
     }
 
     /// A robot from a TOML file, as on a host of its own; and its address.
-    fn robot(&self) -> (Process, String) {
+    pub(crate) fn robot(&self) -> (Process, String) {
+        self.robot_with(&[])
+    }
+
+    /// The same with more flags.
+    pub(crate) fn robot_with(&self, flags: &[&str]) -> (Process, String) {
         let config = format!(
             "listen = \"127.0.0.1:0\"\nidentity = {:?}\npeers = [{:?}]\n",
             self.text("robot.key"),
             self.fingerprint("operator")
         );
         std::fs::write(self.path("robot.toml"), config).unwrap();
-        let robot = Process::start(&[
-            "robot",
-            "--config",
-            &self.text("robot.toml"),
-            "--json",
-            "--follow-stdin",
-        ]);
+        let config = self.text("robot.toml");
+        let first = ["robot", "--config", &config, "--json", "--follow-stdin"];
+        let robot = Process::start(&[&first, flags].concat());
         let listening = robot.event("listening");
         assert_eq!(listening["fingerprint"], self.fingerprint("robot"));
         let addr = listening["addr"].as_str().unwrap().to_owned();
         (robot, addr)
     }
 
-    fn operator(&self, addr: &str, key: &str) -> Process {
+    pub(crate) fn operator(&self, addr: &str, key: &str) -> Process {
         let config = format!(
             "connect = {addr:?}\nidentity = {:?}\npeer = {:?}\nlearn = [{:?}]\nreplay = {:?}\npatience_s = 5.0\n",
             self.text(&format!("{key}.key")),

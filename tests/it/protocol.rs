@@ -21,6 +21,7 @@ use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::{self, Frame};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
+use telemime_protocol::wire::memory::WireMemory;
 use telemime_protocol::wire::pair::{self, AbortCode, Name, PairMessage, Transcript};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
@@ -36,8 +37,10 @@ use telemime_robot::session::{Output, Session, SessionConfig, TickTiming};
 const STATE: WireState = WireState {
     t_us: 3_000_000,
     x: [4_000, -2_000, 25_000],
-    memory_exponent: 5,
-    memory: [[10, -4, 0], [24, -9, 1], [50, -20, 2], [80, -30, 5]],
+    memory: WireMemory {
+        exponents: [0x23, 0x45],
+        offsets: [[80, -32, 0], [96, -36, 4], [100, -40, 4], [80, -30, 5]],
+    },
 };
 
 const PARAMS: WireParams = WireParams {
@@ -48,8 +51,10 @@ const PARAMS: WireParams = WireParams {
 
 const TURN: WireTurn = WireTurn {
     q: WireRotation([4_000, -2_500, 0]),
-    memory_exponent: 6,
-    memory: [[20, -10, 0], [40, -20, 3], [70, -30, 5], [90, -40, 8]],
+    memory: WireMemory {
+        exponents: [0x45, 0x66],
+        offsets: [[80, -40, 0], [80, -40, 6], [70, -30, 5], [90, -40, 8]],
+    },
     params: WireParams {
         gain: 255,
         inflation: 128,
@@ -65,8 +70,10 @@ const BEND: WireBend = WireBend {
         state: WireState {
             t_us: 3_190_000,
             x: [0, 800, -10],
-            memory_exponent: 3,
-            memory: [[0, 40, -1], [0, 90, -2], [1, 120, -4], [1, 125, -4]],
+            memory: WireMemory {
+                exponents: [0x23, 0x33],
+                offsets: [[0, 80, -2], [0, 90, -2], [1, 120, -4], [1, 125, -4]],
+            },
         },
         gain: 255,
         straight: 128,

@@ -3,6 +3,7 @@
 use nalgebra::UnitQuaternion;
 use telemime_protocol::predict::{Forecast, HandState, Params, TurnForecast, TurnState};
 use telemime_protocol::skill::Skill;
+use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WirePose, WireTurn, quantise_grip};
 use telemime_protocol::wire::v1::{MAX_SAMPLE_US, WireParams};
@@ -12,6 +13,8 @@ use super::HandSample;
 /// The newest of the hand, and what it remembers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Hand {
+    /// When its first sample was valid.
+    pub(super) since: Stamp,
     pub(super) place: HandState,
     pub(super) turn: Option<TurnState>,
     pub(super) grip: Option<f64>,
@@ -23,6 +26,7 @@ impl Hand {
         let finite = sample.x.iter().all(|v| v.is_finite());
         let turn = sample.orientation.filter(is_rotation);
         finite.then(|| Self {
+            since: sample.t,
             place: HandState::first(sample.t, sample.x),
             turn: turn.map(|q| TurnState::first(sample.t, q)),
             grip: grip(sample),

@@ -143,6 +143,12 @@ impl Session {
         }
     }
 
+    /// Whether the activity is one the robot has begun with.
+    fn is_granted(&self) -> bool {
+        let planned = matches!(self.activity, Activity::Play { engaged: false, .. });
+        !planned && self.before.is_none()
+    }
+
     fn on_state(&mut self, state: RobotState, cause: Cause) {
         self.state = state;
         match state {
@@ -150,8 +156,9 @@ impl Session {
                 self.next_stop = None;
                 self.end_activity();
             }
-            // The robot let go by itself: the clutch must be pressed again.
-            RobotState::Holding => self.end_activity(),
+            // The robot let go by itself: the clutch must be pressed again. What has not been granted yet it cannot have
+            // let go of: then it says how the last session left it.
+            RobotState::Holding if self.is_granted() => self.end_activity(),
             RobotState::Ready if cause == Cause::PlanFinished => self.end_activity(),
             _ => {}
         }

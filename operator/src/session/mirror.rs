@@ -44,9 +44,6 @@ const COPIES: u8 = 2;
 /// … and again when it is still not acknowledged after the round trip and this long, s.
 const PATIENCE_S: f64 = 0.15;
 
-/// A hand that is not moving when it engages has rested: the arm must not begin what the person has not begun, s.
-const RESTED_S: f64 = 10.0;
-
 /// What is kept of an engagement, in samples: half an hour of a tracker of 60 Hz. What comes later is not.
 const MOST_DRIVEN: usize = 108_000;
 
@@ -100,6 +97,21 @@ impl Mirror {
         // The bound both ends derive their grid from is a whole number of µm.
         let path_bound_m = (path_bound_m * 1e6).round() * 1e-6;
         let path = PathEncoder::new(path_bound_m)?;
+        // A hand that was seen to rest has not begun anything, and the arm must not begin it either.
+        let seen_s = hand.place.t.secs_since(hand.since);
+        let places = Adaptation::of_places(
+            gain,
+            skill.map(|skill| skill.predictor().calibration()),
+            skill.map_or(0.0, |skill| skill.stats().reach_m),
+        )
+        .seen(&hand.place, seen_s);
+        let turning = skill.and_then(Skill::turn);
+        let turns = turning.map(|turn| turn.predictor.model().calibration());
+        let turns = Adaptation::of_turns(gain, turns);
+        let turns = match &hand.turn {
+            Some(turn) => turns.seen(turn, seen_s),
+            None => turns,
+        };
         Ok(Self {
             hand,
             judged: hand,
@@ -114,19 +126,8 @@ impl Mirror {
             unacknowledged: VecDeque::new(),
             first_unacknowledged: 0,
             shown: VecDeque::with_capacity(SHOWN_KNOTS),
-            places: Adaptation::of_places(
-                gain,
-                skill.map(|skill| skill.predictor().calibration()),
-                skill.map_or(0.0, |skill| skill.stats().reach_m),
-            )
-            .rested(RESTED_S),
-            turns: Adaptation::of_turns(
-                gain,
-                skill
-                    .and_then(Skill::turn)
-                    .map(|turn| turn.predictor.model().calibration()),
-            )
-            .rested(RESTED_S),
+            places,
+            turns,
             without_model: false,
             newest: None,
             sent: None,

@@ -18,6 +18,7 @@ mod correcting;
 mod gating;
 mod mirroring;
 mod posing;
+mod resting;
 
 const MS: i64 = 1_000_000;
 const EPOCH: u32 = 17;
@@ -196,4 +197,49 @@ impl Bench {
 
 fn home() -> Vector3<f64> {
     Vector3::new(0.1, 0.2, 2.5)
+}
+
+/// How an arm stands that a former session left: said once a session begins, maybe after something has been asked for.
+const LEFT: RobotControl = RobotControl::State {
+    state: RobotState::Holding,
+    cause: Cause::LeaseExpired,
+    changes: 7,
+};
+
+#[test]
+fn an_arm_that_holds_from_before_ends_nothing_that_is_only_being_asked_for() {
+    let granted = RobotControl::Engaged {
+        engagement: 1,
+        t_us: 0,
+        hand_m: [0.0; 3],
+        tip_m: [0.0; 3],
+        hand_q: None,
+        tip_q: WireRotation::default(),
+    };
+    let mut bench = Bench::ready(SessionConfig::default(), None);
+    let t: Vec<f64> = (0..50).map(|i| f64::from(i) * 0.1).collect();
+    let x: Vec<_> = t.iter().map(|&t| home() * (0.1 * t)).collect();
+    let plan = telemime_protocol::checkpoint::select::bounded(&t, &x, 0.01).unwrap();
+    bench.session.play(&plan.into(), None);
+    bench.hears(&LEFT);
+    bench.hears(&RobotControl::PlanStored { id: 1 });
+    let asks = |c: &OperatorControl| matches!(c, OperatorControl::Engage(_));
+    assert!(bench.control.iter().any(asks), "{:?}", bench.control);
+
+    let mut bench = Bench::ready(SessionConfig::default(), None);
+    bench.sample(home());
+    bench.session.engage(bench.now);
+    bench.hears(&LEFT);
+    bench.hears(&granted);
+    bench.forget();
+    for _ in 0..30 {
+        bench.sample(home());
+    }
+    assert!(!bench.motions().is_empty(), "it drives");
+    bench.hears(&LEFT);
+    bench.forget();
+    for _ in 0..30 {
+        bench.sample(home());
+    }
+    assert!(bench.motions().is_empty(), "what it was granted is over");
 }

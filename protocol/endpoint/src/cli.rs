@@ -153,6 +153,8 @@ pub enum Word {
     Stop,
     /// `reset`: leave the latched stop.
     Reset,
+    /// `blackbox`: write the record of the last minutes.
+    BlackBox,
     /// `pair` or `pair 30s`: open a pairing window.
     Pair(Duration),
     /// `yes`: the codes are the same.
@@ -174,7 +176,7 @@ pub const PAIRING_WINDOW: Duration = Duration::from_secs(60);
 pub const LONGEST_WINDOW: Duration = Duration::from_secs(600);
 
 /// What a robot's terminal understands.
-pub const ROBOT_WORDS: &str = "stop, reset, pair, yes, no or quit";
+pub const ROBOT_WORDS: &str = "stop, reset, blackbox, pair, yes, no or quit";
 
 /// What an operator's terminal understands.
 pub const OPERATOR_WORDS: &str = "stop, reset, keep, refine, save FILE or quit";
@@ -190,6 +192,7 @@ impl Word {
         match (word, rest.trim()) {
             ("stop", "") => Some(Self::Stop),
             ("reset", "") => Some(Self::Reset),
+            ("blackbox", "") => Some(Self::BlackBox),
             ("pair", "") => Some(Self::Pair(PAIRING_WINDOW)),
             ("pair", span) => seconds(span).ok().map(Self::Pair),
             ("yes", "") => Some(Self::Yes),

@@ -9,7 +9,18 @@ use telemime_protocol::wire::v1::ExternalClock;
 use tokio::time::Instant;
 
 /// A moment on the host's monotonic clock (`CLOCK_MONOTONIC`), ns. Common to all processes of a host.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(
+    Clone,
+    Copy,
+    Debug,
+    Default,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    serde::Serialize,
+    serde::Deserialize,
+)]
 pub struct Mono(pub i64);
 
 impl Mono {

@@ -2,6 +2,7 @@
 //! (the present's own axes) for orientations.
 
 use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
 
 use super::params::WEIGHTED;
 use super::{BLOCK, Experts, KNOT_SPACING_S, MAX_KNOTS, Params};
@@ -53,7 +54,7 @@ impl Motion {
 }
 
 /// A predicted displacement and how far to trust it.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Knot {
     /// Displacement from the newest position or orientation, m or rad.
     pub displacement: Vector3<f64>,
@@ -70,7 +71,7 @@ const STILL: Knot = Knot {
 };
 
 /// Where things go from the present: plain numbers, no reference to the model.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Ahead {
     /// Knot j is j·[`KNOT_SPACING_S`] ahead; knot 0 is the present and entries beyond `count` are unused.
     pub knots: [Knot; MAX_KNOTS + 1],
@@ -94,6 +95,11 @@ pub struct Way {
 }
 
 impl Ahead {
+    /// Whether `count` is of knots that there are: one that was made here always is, one that was read from a file need not.
+    pub fn is_sound(&self) -> bool {
+        (1..=MAX_KNOTS).contains(&self.count)
+    }
+
     /// Fuses the experts: `x̂ = x + κ·Σ w_e·y_e`, and the covariance of that mixture, the distances between the experts included,
     /// `φ·Σ w_e·(C_e + (y_e − ȳ)(y_e − ȳ)ᵀ)`.
     ///

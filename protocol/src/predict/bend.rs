@@ -4,6 +4,7 @@
 //! leave one behind.
 
 use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
 
 use super::Forecast;
 
@@ -20,7 +21,7 @@ pub const PUSH_REACH_S: f64 = 0.3;
 const NOTHING_M: f64 = 1e-3;
 
 /// What the operator makes of a plan, from one moment on.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Bend {
     /// The plan's time at that moment, s; before its beginning and after its end the plan rests.
     pub plan_s: f64,
@@ -33,7 +34,7 @@ pub struct Bend {
 }
 
 /// A hand that holds on.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Held {
     /// Its displacement since it took hold, m, and where that goes.
     pub push: Forecast,

@@ -1,6 +1,7 @@
 //! The predicted path of the hand.
 
 use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
 
 use super::ahead::{Ahead, Motion};
 use super::{Experts, HandState, MEMORY_TAU_S, Model, Params};
@@ -13,7 +14,7 @@ const ONSET_M_S: f64 = 0.5;
 const REACH_M: f64 = 0.3;
 
 /// The predicted path of the hand from one state: plain numbers, no reference to the model.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Forecast {
     /// When the state it starts from was valid.
     pub t: Stamp,

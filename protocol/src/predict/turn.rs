@@ -4,6 +4,7 @@
 //! mean: the logarithm's cut then lies where that component has nothing to say.
 
 use nalgebra::{SVector, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
 
 use super::ahead::{Ahead, CHECK_HORIZONS_S, FOLD_SEED, Motion, fold};
 use super::forecast::{Forecast, motion};
@@ -150,7 +151,7 @@ impl TurnModel {
 }
 
 /// The predicted course of the orientation from one state.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TurnForecast {
     /// When the state it starts from was valid.
     pub t: Stamp,

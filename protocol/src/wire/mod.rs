@@ -7,6 +7,7 @@ pub mod codec;
 pub mod frame;
 pub mod hello;
 pub mod knots;
+pub mod memory;
 pub mod pair;
 mod params;
 pub mod state;

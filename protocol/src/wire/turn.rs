@@ -4,6 +4,7 @@ use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::codec::DecodeError;
+use super::memory::WireMemory;
 use super::v1::WireParams;
 use crate::pose;
 use crate::predict::{TurnForecast, TurnState};
@@ -16,7 +17,7 @@ pub const ROTATION_STEP_RAD: f64 = 1e-4;
 /// π in steps, rounded up.
 const HALF_TURN: i16 = 31_416;
 
-/// Step of `memory_exponent` 0, rad; each further one doubles it.
+/// Finest step of a memory, rad.
 const MEMORY_STEP_RAD: f64 = 2.5e-5;
 
 /// 127 steps of it are more than π.
@@ -56,15 +57,13 @@ impl WireRotation {
 }
 
 /// [`TurnState`] in integers, valid when the hand state it travels with is. The memories travel as the
-/// rotation vectors `log(mᵢ⁻¹q)` in 8 bits each, with one common power-of-two step.
+/// rotation vectors `log(mᵢ⁻¹q)` in 8 bits each, every one with a power-of-two step of its own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WireTurn {
     /// Orientation, from the hand's own axes to the tracker's.
     pub q: WireRotation,
-    /// log₂ of the memories' step in units of 25 µrad.
-    pub memory_exponent: u8,
-    /// `log(mᵢ⁻¹q)` per memory and axis, in that step.
-    pub memory: [[i8; 3]; 4],
+    /// `log(mᵢ⁻¹q)` for each memory, its unit 25 µrad.
+    pub memory: WireMemory,
     /// Parameters to predict with.
     pub params: WireParams,
 }
@@ -72,17 +71,10 @@ pub struct WireTurn {
 impl WireTurn {
     /// Quantises a state with the parameters it is to be predicted by.
     pub fn quantise(state: &TurnState, params: WireParams) -> Self {
-        let offsets = state.memory.map(|m| pose::between(&m, &state.q));
-        let largest = offsets.iter().map(|o| o.amax()).fold(0.0, f64::max);
-        let (mut memory_exponent, mut step) = (0, MEMORY_STEP_RAD);
-        while largest > 127.0 * step && memory_exponent < MAX_EXPONENT {
-            memory_exponent += 1;
-            step *= 2.0;
-        }
         Self {
             q: WireRotation::quantise(&state.q),
-            memory_exponent,
-            memory: offsets.map(|o| o.map(|v| (v / step).round() as i8).into()),
+            memory: WireMemory::quantise(&state.ways(), MEMORY_STEP_RAD)
+                .expect("no angle between two orientations is above π"),
             params,
         }
     }
@@ -90,11 +82,8 @@ impl WireTurn {
     /// The state both ends predict from; `t` is that of the hand state it came with.
     pub fn dequantise(&self, t: Stamp) -> TurnState {
         let q = self.q.dequantise();
-        let step = MEMORY_STEP_RAD * f64::from(1_u32 << self.memory_exponent.min(MAX_EXPONENT));
-        let memory = self.memory.map(|m| {
-            let back = Vector3::from(m.map(|v| f64::from(v) * -step));
-            pose::moved(&q, &back)
-        });
+        let ways = self.memory.dequantise(MEMORY_STEP_RAD);
+        let memory = ways.map(|way| pose::moved(&q, &-way));
         TurnState { t, q, memory }
     }
 
@@ -123,9 +112,9 @@ impl WirePose {
         let Some(turn) = &self.turn else {
             return Ok(());
         };
-        if turn.memory_exponent > MAX_EXPONENT {
+        if turn.memory.exponents().iter().any(|e| *e > MAX_EXPONENT) {
             return Err(DecodeError::Invalid {
-                field: "pose.memory_exponent",
+                field: "pose.memory",
                 why: "above 10",
             });
         }
@@ -173,8 +162,8 @@ mod tests {
             prop_assert!(pose.check().is_ok());
             let again = wire.dequantise(Stamp(7));
             prop_assert!(again.q.angle_to(&q) < 0.9 * ROTATION_STEP_RAD);
-            let step = MEMORY_STEP_RAD * f64::from(1 << wire.memory_exponent);
-            for (a, b) in again.memory.iter().zip(&state.memory) {
+            for ((a, b), e) in again.memory.iter().zip(&state.memory).zip(wire.memory.exponents()) {
+                let step = MEMORY_STEP_RAD * f64::from(1 << e);
                 // At half a turn the axis has two signs.
                 prop_assert!(a.angle_to(b) < step + 2.0 * ROTATION_STEP_RAD, "{}", a.angle_to(b));
             }
@@ -196,11 +185,13 @@ mod tests {
 
     #[test]
     fn what_no_encoder_writes_is_refused() {
-        let turn = |q, memory_exponent| WirePose {
+        let turn = |q, exponent: u8| WirePose {
             turn: Some(WireTurn {
                 q: WireRotation(q),
-                memory_exponent,
-                memory: [[0; 3]; 4],
+                memory: WireMemory {
+                    exponents: [0, exponent],
+                    ..WireMemory::default()
+                },
                 params: WireParams {
                     gain: 0,
                     inflation: 0,
@@ -212,6 +203,8 @@ mod tests {
         assert!(turn([31_416, -31_416, 0], 10).check().is_ok());
         assert!(turn([31_417, 0, 0], 0).check().is_err());
         assert!(turn([i16::MIN, 0, 0], 0).check().is_err());
+        assert!(turn([0; 3], 0xaa).check().is_ok());
         assert!(turn([0; 3], 11).check().is_err());
+        assert!(turn([0; 3], 0xb0).check().is_err());
     }
 }

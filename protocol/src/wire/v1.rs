@@ -240,6 +240,8 @@ pub enum Cause {
     ClockStep,
     /// The robot fell behind its own work.
     Fault,
+    /// What drives the arm failed, or says what cannot be.
+    ArmFault,
 }
 
 /// Why a request is declined.

@@ -3,6 +3,7 @@
 use rand::{Rng, RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use telemime_protocol::wire::bend::{WireBend, WireHeld};
+use telemime_protocol::wire::memory::WireMemory;
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::WireParams;
@@ -56,8 +57,15 @@ impl Draw {
         WireState {
             t_us: self.signed(53),
             x: std::array::from_fn(|_| self.signed(19) as i32),
-            memory_exponent: self.below(21) as u8,
-            memory: std::array::from_fn(|_| std::array::from_fn(|_| self.u8() as i8)),
+            memory: self.memory(16),
+        }
+    }
+
+    fn memory(&mut self, exponents: usize) -> WireMemory {
+        let mut exponent = || self.below(exponents) as u8;
+        WireMemory {
+            exponents: std::array::from_fn(|_| exponent() << 4 | exponent()),
+            offsets: std::array::from_fn(|_| std::array::from_fn(|_| self.u8() as i8)),
         }
     }
 
@@ -98,8 +106,7 @@ impl Draw {
         WirePose {
             turn: self.maybe(|d| WireTurn {
                 q: d.rotation(),
-                memory_exponent: d.below(11) as u8,
-                memory: std::array::from_fn(|_| std::array::from_fn(|_| d.u8() as i8)),
+                memory: d.memory(11),
                 params: d.params(),
             }),
             grip: self.maybe(Self::u8),

@@ -10,6 +10,7 @@ use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::knots::KnotBlock;
+use telemime_protocol::wire::memory::WireMemory;
 use telemime_protocol::wire::pair::{AbortCode, Name, PairMessage, commitment};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::WireTurn;
@@ -57,11 +58,16 @@ pub(crate) fn moving(i: u32) -> Motion {
     let mut state = WireState {
         t_us: 3_000_000 + i64::from(i) * 33_333,
         x: [(1000.0 * s) as i32 - 3000, 500 - 200 * i as i32, 8000],
-        memory_exponent: 4 + (i % 8) as u8,
-        memory: [[10, -4, 0], [24, -9, 1], [50, -20, 2], [80, -30, 5]],
+        memory: WireMemory {
+            exponents: [
+                ((4 + i % 8) << 4 | (5 + i % 8)) as u8,
+                ((6 + i % 8) << 4 | (3 + i % 8)) as u8,
+            ],
+            offsets: [[10, -4, 0], [24, -9, 1], [50, -20, 2], [80, -30, 5]],
+        },
     };
     if i == 0 {
-        (state.memory_exponent, state.memory) = (0, [[0; 3]; 4]);
+        state.memory = WireMemory::default();
     }
     let params = Draw::new(100 + u64::from(i)).params();
     let turn = WireTurn {
@@ -70,8 +76,13 @@ pub(crate) fn moving(i: u32) -> Motion {
             -2500,
             300 * i as i16,
         ]),
-        memory_exponent: 3 + (i % 8) as u8,
-        memory: [[20, -10, 0], [40, -20, 3], [70, -30, 5], [90, -40, 8]],
+        memory: WireMemory {
+            exponents: [
+                ((2 + i % 8) << 4 | (1 + i % 8)) as u8,
+                ((3 + i % 8) << 4 | (2 + i % 8)) as u8,
+            ],
+            offsets: [[20, -10, 0], [40, -20, 3], [70, -30, 5], [90, -40, 8]],
+        },
         params: Draw::new(200 + u64::from(i)).params(),
     };
     Motion {

@@ -131,7 +131,7 @@ const STATES: [RobotState; 6] = [
     RobotState::Stopped,
 ];
 
-const CAUSES: [Cause; 10] = [
+const CAUSES: [Cause; 11] = [
     Cause::Requested,
     Cause::NewsArrived,
     Cause::NewsLate,
@@ -142,6 +142,7 @@ const CAUSES: [Cause; 10] = [
     Cause::LocalStop,
     Cause::ClockStep,
     Cause::Fault,
+    Cause::ArmFault,
 ];
 
 const REASONS: [Refusal; 11] = [

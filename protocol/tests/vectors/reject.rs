@@ -363,7 +363,7 @@ fn control(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
     say(
         ROBOT_CONTROL,
         "an unknown cause",
-        vec![5, 0, 10, 0],
+        vec![5, 0, 11, 0],
         "Malformed",
     );
 }
@@ -413,12 +413,6 @@ fn datagrams(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
     );
     say(
         OPERATOR_DATAGRAM,
-        "a memory exponent of 21",
-        sent(|m| m.state.memory_exponent = 21),
-        "Invalid",
-    );
-    say(
-        OPERATOR_DATAGRAM,
         "a rotation beyond half a turn",
         sent(|m| m.pose.turn.as_mut().expect("it turns").q.0[1] = 31_417),
         "Invalid",
@@ -426,7 +420,7 @@ fn datagrams(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
     say(
         OPERATOR_DATAGRAM,
         "a turn's exponent of 11",
-        sent(|m| m.pose.turn.as_mut().expect("it turns").memory_exponent = 11),
+        sent(|m| m.pose.turn.as_mut().expect("it turns").memory.exponents[1] = 0x1b),
         "Invalid",
     );
     say(

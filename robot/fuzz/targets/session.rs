@@ -50,7 +50,7 @@ impl<'a> Input<'a> {
 
 struct Bench {
     session: Session,
-    core: servo::Core,
+    core: servo::Station,
     handle: Handle,
     info: Info,
     now: Mono,

@@ -12,14 +12,14 @@ use crate::servo::Report;
 const QUEUE: usize = 8192;
 
 /// Writes ticks to a CSV file from a thread of its own.
-pub(super) struct Recorder {
+pub(super) struct TickRecorder {
     path: PathBuf,
     queue: SyncSender<Report>,
     thread: std::thread::JoinHandle<std::io::Result<()>>,
     lost: u64,
 }
 
-impl Recorder {
+impl TickRecorder {
     pub(super) fn start(path: &Path, dof: usize) -> anyhow::Result<Self> {
         let file = std::fs::File::create(path)
             .with_context(|| format!("cannot write {}", path.display()))?;

@@ -1,13 +1,16 @@
 //! What the robot says: lines to read, or events for machines.
 
 use std::net::SocketAddr;
+use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use telemime_endpoint::cli::Printer;
 use telemime_endpoint::pairing::Candidate;
 
+use crate::blackbox::{Due, Saved};
 use crate::desk::Progress;
-use crate::servo::Report;
+use crate::servo::thread::Times;
+use crate::servo::{ArmFault, Locked, Realtime, Report};
 
 /// What the robot prints with `--json`; `docs/commands.md` lists the fields.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -70,10 +73,36 @@ pub enum Event {
     Path {
         knots: Vec<(f64, [f64; 3], [f64; 3], bool)>,
     },
+    Driver {
+        command: String,
+        joints: Vec<String>,
+        rate_hz: f64,
+    },
+    Realtime {
+        priority: Option<u8>,
+        memory: Option<String>,
+        why: Option<String>,
+    },
+    ArmFault {
+        fault: ArmFault,
+        why: String,
+    },
+    BlackBox {
+        why: String,
+        file: Option<PathBuf>,
+        error: Option<String>,
+    },
     Servo {
         ticks: u64,
         mean_ns: u32,
+        p50_ns: u32,
         p99_ns: u32,
+        p999_ns: u32,
+        max_ns: u32,
+        wake_p50_ns: u32,
+        wake_p99_ns: u32,
+        wake_p999_ns: u32,
+        wake_max_ns: u32,
         overruns: u32,
     },
 }
@@ -137,6 +166,94 @@ impl Log {
             why,
         };
         self.say(&event, text);
+    }
+}
+
+impl Log {
+    /// What became of a record.
+    pub(super) fn black_box(&self, due: Due, saved: &Saved) {
+        let why = due.words();
+        let text = match saved {
+            Ok(path) => format!("black box ({why}): {}", path.display()),
+            Err(e) => format!("black box ({why}): {e}"),
+        };
+        let event = Event::BlackBox {
+            why,
+            file: saved.as_ref().ok().cloned(),
+            error: saved.as_ref().err().map(ToString::to_string),
+        };
+        self.say(&event, || text);
+    }
+
+    /// What of a real-time priority was to be had.
+    pub(super) fn realtime(&self, granted: &Realtime) {
+        let Realtime { priority, locked } = granted;
+        let memory = locked.as_ref().ok().map(|locked| match locked {
+            Locked::All => "all",
+            Locked::Present => "present",
+        });
+        let refused = [
+            priority.as_ref().err().map(|e| {
+                format!("no real-time priority ({e}): allow it by ulimit -r or CAP_SYS_NICE")
+            }),
+            locked.as_ref().err().map(|e| {
+                format!("memory is not locked ({e}): allow it by ulimit -l or CAP_IPC_LOCK")
+            }),
+        ];
+        let refused: Vec<_> = refused.into_iter().flatten().collect();
+        let why = (!refused.is_empty()).then(|| refused.join("; "));
+        let event = Event::Realtime {
+            priority: priority.as_ref().ok().copied(),
+            memory: memory.map(str::to_owned),
+            why: why.clone(),
+        };
+        self.say(&event, || match why {
+            Some(why) => format!("servo: {why}"),
+            None => format!(
+                "servo: SCHED_FIFO, {}; {} memory locked",
+                priority.as_ref().map_or(0, |p| *p),
+                memory.unwrap_or("no")
+            ),
+        });
+    }
+
+    /// How long ticks took, and how late they began.
+    pub(super) fn servo(&self, times: &Times) {
+        let Times {
+            ticks,
+            mean_ns,
+            work,
+            wake,
+            overruns,
+        } = *times;
+        let event = Event::Servo {
+            ticks,
+            mean_ns,
+            p50_ns: work.p50_ns,
+            p99_ns: work.p99_ns,
+            p999_ns: work.p999_ns,
+            max_ns: work.max_ns,
+            wake_p50_ns: wake.p50_ns,
+            wake_p99_ns: wake.p99_ns,
+            wake_p999_ns: wake.p999_ns,
+            wake_max_ns: wake.max_ns,
+            overruns,
+        };
+        let us = |ns: u32| f64::from(ns) * 1e-3;
+        self.say(&event, || {
+            format!(
+                "servo: {ticks} ticks, {overruns} late\n  work    {:.1} µs mean; {:.1} p50, {:.1} p99, {:.1} p99.9, {:.1} max\n  wake-up {:.1} µs p50, {:.1} p99, {:.1} p99.9, {:.1} max",
+                us(mean_ns),
+                us(work.p50_ns),
+                us(work.p99_ns),
+                us(work.p999_ns),
+                us(work.max_ns),
+                us(wake.p50_ns),
+                us(wake.p99_ns),
+                us(wake.p999_ns),
+                us(wake.max_ns),
+            )
+        });
     }
 }
 

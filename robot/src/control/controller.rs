@@ -3,13 +3,18 @@
 use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
-use telemime_sim::arm::{ArmModel, DeadTime, DeadTimeError, Joints, PlantError, check_start};
+use serde::{Deserialize, Serialize};
+use telemime_sim::arm::{
+    ArmModel, DeadTime, DeadTimeError, Joints, MAX_DEAD_TIME_S, PlantError, check_start,
+};
 
-use super::ik::{DifferentialIk, quaternion};
+use super::barrier::Barrier;
+use super::ik::{DifferentialIk, IkState, quaternion};
 use super::turn::checked;
 use super::{
-    CartesianLimits, ComputedTorque, FilterConfig, FilterError, FilterState, IkConfig,
-    JointReference, LimitedFilter, TurnFilter, TurnLimits, TurnState, joint_accelerations,
+    BarrierConfig, BarrierError, CartesianLimits, ComputedTorque, FilterConfig, FilterError,
+    FilterState, IkConfig, JointReference, LimitedFilter, TurnFilter, TurnLimits, TurnState,
+    joint_accelerations,
 };
 
 /// The filter's reference may lead the joints' reference by this much, m; beyond, the arm cannot follow and the filter waits for it.
@@ -19,7 +24,7 @@ const LEASH_M: f64 = 0.002;
 const LEASH_RAD: f64 = 0.05;
 
 /// Bandwidth, limits and gains of a [`Controller`].
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ControlConfig {
     /// The filter's poles lie at −ω, rad/s: the tip lags the demand by 3/ω.
     pub omega: f64,
@@ -35,6 +40,8 @@ pub struct ControlConfig {
     pub posture_gain: f64,
     /// The arm obeys its setpoints this much later, s, at most [`MAX_DEAD_TIME_S`](telemime_sim::arm::MAX_DEAD_TIME_S).
     pub dead_time_s: f64,
+    /// What the arm is kept from: itself, and planes.
+    pub barrier: BarrierConfig,
     /// Tick, s.
     pub dt_s: f64,
 }
@@ -43,7 +50,8 @@ impl Default for ControlConfig {
     /// 1 kHz, and the tip limits of a published arm.
     fn default() -> Self {
         Self {
-            omega: 45.0,
+            // 3/ω is part of the horizon, and ω³ of the jerk: the fastest that is no rougher than the hand itself on recorded gestures.
+            omega: 40.0,
             limits: CartesianLimits {
                 v_max: 1.7,
                 a_max: 13.0,
@@ -58,6 +66,7 @@ impl Default for ControlConfig {
             orientation_gain: 8.0,
             posture_gain: 1.0,
             dead_time_s: 0.0,
+            barrier: BarrierConfig::default(),
             dt_s: 1e-3,
         }
     }
@@ -75,6 +84,9 @@ pub enum ControlError {
     /// The arm's dead time is out of range.
     #[error(transparent)]
     DeadTime(#[from] DeadTimeError),
+    /// The barrier's distances or planes are impossible.
+    #[error(transparent)]
+    Barrier(#[from] BarrierError),
     /// A gain that is not a positive number.
     #[error("{what} is {value}; it must be a positive number, and small against 1/dt")]
     Gain {
@@ -138,6 +150,10 @@ pub struct Clamps {
     pub turn_held_back: bool,
     /// The demand or the measured state was not finite, or its orientation not a unit quaternion: stopped, or controlled by the reference.
     pub invalid: bool,
+    /// The joints' step was slowed, or led aside, to keep the links apart.
+    pub near_itself: bool,
+    /// The same to keep the tip and the links inside of a plane, or the target was moved there.
+    pub near_plane: bool,
     /// Joints held back by their end of range.
     pub at_limit: u16,
     /// Joints whose torque was cut.
@@ -163,6 +179,10 @@ pub struct ClampCounts {
     pub turn_held_back: u64,
     /// See [`Clamps::invalid`].
     pub invalid: u64,
+    /// See [`Clamps::near_itself`].
+    pub near_itself: u64,
+    /// See [`Clamps::near_plane`].
+    pub near_plane: u64,
     /// Ticks with any joint of [`Clamps::at_limit`].
     pub at_limit: u64,
     /// Ticks with any joint of [`Clamps::torque`].
@@ -179,6 +199,8 @@ impl ClampCounts {
         self.held_back += u64::from(clamps.held_back);
         self.turn_held_back += u64::from(clamps.turn_held_back);
         self.invalid += u64::from(clamps.invalid);
+        self.near_itself += u64::from(clamps.near_itself);
+        self.near_plane += u64::from(clamps.near_plane);
         self.at_limit += u64::from(clamps.at_limit != 0);
         self.torque += u64::from(clamps.torque != 0);
     }
@@ -199,11 +221,50 @@ pub struct Output {
     pub orientation: UnitQuaternion<f64>,
     /// The angle from there to the orientation demanded, or to the one being kept, rad: of a demand that turns, what is due only [`Controller::lag_s`] later is part of it.
     pub orientation_error_rad: f64,
-    /// The setpoint that the joints' drives follow at this tick, rad or m: the reference of the dead time ago.
-    pub q_ref: Joints,
+    /// The setpoint that the joints' drives follow at this tick: the reference of the dead time ago.
+    pub setpoint: JointReference,
     /// What was clamped.
     pub clamps: Clamps,
 }
+
+/// All of a [`Controller`] that a later tick depends on.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct ControllerState {
+    filter: FilterState,
+    turn: TurnState,
+    turns: bool,
+    ik: IkState,
+    /// On their way, the next one due first.
+    setpoints: Vec<JointReference>,
+}
+
+impl ControllerState {
+    /// One that any controller can be saved into without an allocation.
+    pub fn with_room(dt_s: f64) -> Self {
+        let most = (MAX_DEAD_TIME_S / dt_s).round() as usize;
+        Self {
+            setpoints: Vec::with_capacity(most),
+            ..Self::default()
+        }
+    }
+}
+
+impl ControllerState {
+    /// A copy with as much room for setpoints.
+    pub(crate) fn roomy_clone(&self) -> Self {
+        let mut setpoints = Vec::with_capacity(self.setpoints.capacity());
+        setpoints.extend_from_slice(&self.setpoints);
+        Self {
+            setpoints,
+            ..self.clone()
+        }
+    }
+}
+
+/// A state that another kind of controller has saved.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the state is that of a controller with another dead time")]
+pub struct ForeignState;
 
 /// Filter, inverse kinematics and computed torque in one fixed tick.
 #[derive(Clone, Debug)]
@@ -256,7 +317,14 @@ impl Controller {
             posture_gain: config.posture_gain,
             dt_s: config.dt_s,
         };
-        let mut ik = DifferentialIk::new(Arc::clone(&arm), ik_config, accelerations, &q);
+        let barrier = Barrier::new(
+            Arc::clone(&arm),
+            &config.barrier,
+            accelerations,
+            &q,
+            config.dt_s,
+        )?;
+        let mut ik = DifferentialIk::new(Arc::clone(&arm), ik_config, accelerations, barrier, &q);
         let filter_config = FilterConfig {
             omega: config.omega,
             v_max: limits.v_max,
@@ -339,6 +407,35 @@ impl Controller {
         tip
     }
 
+    /// Where the joints' reference is.
+    pub fn joint_reference(&self) -> &JointReference {
+        self.ik.reference()
+    }
+
+    /// All that a later tick depends on, into `state`; allocates nothing if that has held the state of this controller before, or room for it.
+    pub fn save(&self, state: &mut ControllerState) {
+        state.filter = *self.filter.state();
+        state.turn = self.turn.state();
+        state.turns = self.turns;
+        state.ik = self.ik.save();
+        self.setpoints.save(&mut state.setpoints);
+    }
+
+    /// Goes on from `state`, which a controller of the same arm and configuration has saved.
+    ///
+    /// # Errors
+    /// [`ForeignState`] for one of another dead time.
+    pub fn restore(&mut self, state: &ControllerState) -> Result<(), ForeignState> {
+        if !self.setpoints.restore(&state.setpoints) {
+            return Err(ForeignState);
+        }
+        self.filter.restore(state.filter);
+        self.turn.restore(state.turn);
+        self.turns = state.turns;
+        self.ik.restore(&state.ik);
+        Ok(())
+    }
+
     /// One tick at the measured `q` (rad, m) and `qd` (rad/s, m/s).
     pub fn tick(&mut self, demand: Demand, q: &Joints, qd: &Joints) -> Output {
         let now = (*self.filter.state(), *self.ik.reference());
@@ -353,6 +450,8 @@ impl Controller {
         clamps.slowed = step.slowed;
         clamps.turning |= step.turn_slowed;
         clamps.singular = step.singular;
+        clamps.near_itself = step.near_itself;
+        clamps.near_plane |= step.near_plane;
         clamps.at_limit = step.at_limit;
         let lead = step.error_m.norm();
         if lead > LEASH_M {
@@ -390,7 +489,7 @@ impl Controller {
             tip: kinematics.tip(),
             orientation,
             orientation_error_rad: orientation.angle_to(&asked),
-            q_ref: joints.q,
+            setpoint: joints,
             clamps,
         }
     }
@@ -419,6 +518,8 @@ impl Controller {
             clamps.turning = self.turn.stop();
             return (false, None);
         }
+        let (target, clipped) = self.ik.clip(target);
+        clamps.near_plane = clipped;
         clamps.filter = self.filter.follow(target, speed_scale);
         clamps.turning = match unit {
             Some(unit) => {

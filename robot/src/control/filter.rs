@@ -1,6 +1,7 @@
 //! The third-order limited filter between the prediction and the arm.
 
 use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
 
 /// Limits and bandwidth of a [`LimitedFilter`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,7 +46,7 @@ pub enum FilterError {
 }
 
 /// Position, velocity and acceleration of the filter's output.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct FilterState {
     /// Position, m.
     pub p: Vector3<f64>,
@@ -125,6 +126,11 @@ impl LimitedFilter {
     /// The output.
     pub fn state(&self) -> &FilterState {
         &self.state
+    }
+
+    /// Goes on from `state`.
+    pub(super) fn restore(&mut self, state: FilterState) {
+        self.state = state;
     }
 
     /// Rest at `p`.

@@ -3,8 +3,10 @@
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Rotation3, SMatrix, SymmetricEigen, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
 use telemime_sim::arm::{ArmModel, Jacobian, Joints, Kinematics, MAX_JOINTS};
 
+use super::barrier::Barrier;
 use super::filter::limited;
 use super::turn::{TurnState, rotation_between};
 
@@ -41,7 +43,7 @@ pub struct IkConfig {
 }
 
 /// Joint positions, velocities and accelerations that the torque control follows.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct JointReference {
     /// Position, rad or m.
     pub q: Joints,
@@ -49,6 +51,19 @@ pub struct JointReference {
     pub qd: Joints,
     /// Acceleration until the next tick, rad/s² or m/s².
     pub qdd: Joints,
+}
+
+/// All of a [`DifferentialIk`] that a later step depends on.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
+pub(super) struct IkState {
+    orientation: Matrix3<f64>,
+    secondary_share: f64,
+    reference: JointReference,
+    turn_share: f64,
+    tip_velocity: Vector3<f64>,
+    angular_velocity: Vector3<f64>,
+    /// A posture, and the room that the barrier found there.
+    barrier: (Joints, f64),
 }
 
 /// What a step ran into; bit `i` stands for joint `i`.
@@ -60,6 +75,10 @@ pub struct JointStep {
     pub turn_slowed: bool,
     /// The tip is near a singular posture: motion is damped.
     pub singular: bool,
+    /// The step was slowed, or led aside, to keep the links apart.
+    pub near_itself: bool,
+    /// The same to keep what a plane guards inside.
+    pub near_plane: bool,
     /// Joints held back by their end of range.
     pub at_limit: u16,
     /// Where the reference is to be, less where it is, m.
@@ -237,6 +256,7 @@ pub(super) struct DifferentialIk {
     /// The same, rad/s.
     angular_velocity: Vector3<f64>,
     kinematics: Kinematics,
+    barrier: Barrier,
 }
 
 impl DifferentialIk {
@@ -245,6 +265,7 @@ impl DifferentialIk {
         arm: Arc<ArmModel>,
         config: IkConfig,
         accelerations: Joints,
+        barrier: Barrier,
         q: &Joints,
     ) -> Self {
         let mut ik = Self {
@@ -263,6 +284,7 @@ impl DifferentialIk {
             tip_velocity: Vector3::zeros(),
             angular_velocity: Vector3::zeros(),
             kinematics: Kinematics::new(),
+            barrier,
         };
         ik.reset(q);
         ik
@@ -282,6 +304,42 @@ impl DifferentialIk {
         self.kinematics.update(&self.arm, q);
         self.orientation = *self.kinematics.tip_rotation();
         self.kinematics.tip()
+    }
+
+    pub(super) fn save(&self) -> IkState {
+        IkState {
+            orientation: self.orientation,
+            secondary_share: self.secondary_share,
+            reference: self.reference,
+            turn_share: self.turn_share,
+            tip_velocity: self.tip_velocity,
+            angular_velocity: self.angular_velocity,
+            barrier: *self.barrier.known(),
+        }
+    }
+
+    pub(super) fn restore(&mut self, state: &IkState) {
+        let IkState {
+            orientation,
+            secondary_share,
+            reference,
+            turn_share,
+            tip_velocity,
+            angular_velocity,
+            barrier,
+        } = *state;
+        self.orientation = orientation;
+        self.secondary_share = secondary_share;
+        self.reference = reference;
+        self.turn_share = turn_share;
+        self.tip_velocity = tip_velocity;
+        self.angular_velocity = angular_velocity;
+        self.barrier.restore(barrier);
+    }
+
+    /// The nearest place that no plane excludes, and whether that is another one.
+    pub(super) fn clip(&self, target: Vector3<f64>) -> (Vector3<f64>, bool) {
+        self.barrier.clip(target)
     }
 
     pub(super) fn reference(&self) -> &JointReference {
@@ -393,6 +451,8 @@ impl DifferentialIk {
             next[i] = next[i].clamp(lower[i].max(-f64::MAX), upper[i].min(f64::MAX));
             next[i] = next[i].clamp(qd[i] - most[i], qd[i] + most[i]);
         }
+        let (next_apart, hindered) = self.barrier.guard((&q, &qd), next, (&lower, &upper), &most);
+        next = next_apart;
         let mut q_next = q + (qd + next) * (0.5 * h);
         for (i, joint) in self.arm.joints().iter().enumerate() {
             let inside = q_next[i].clamp(joint.lower, joint.upper);
@@ -412,6 +472,8 @@ impl DifferentialIk {
         JointStep {
             slowed: held || primary_share < 1.0 || change_share < 1.0,
             singular: sigma_min < epsilon,
+            near_itself: hindered.by_itself,
+            near_plane: hindered.by_plane,
             at_limit,
             error_m,
             tip_velocity: self.tip_velocity,

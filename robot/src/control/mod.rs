@@ -3,6 +3,7 @@
 //! Nothing here allocates after construction: every vector has a fixed size and every workspace is a field. Nothing here
 //! reads a clock: a tick is `dt_s` long.
 
+mod barrier;
 mod controller;
 mod filter;
 mod ik;
@@ -13,8 +14,10 @@ mod turn;
 #[cfg(test)]
 mod tests;
 
+pub use barrier::{BarrierConfig, BarrierError, MAX_PLANES, Plane};
 pub use controller::{
-    ClampCounts, Clamps, ControlConfig, ControlError, Controller, Demand, Output,
+    ClampCounts, Clamps, ControlConfig, ControlError, Controller, ControllerState, Demand,
+    ForeignState, Output,
 };
 pub use filter::{FilterConfig, FilterError, FilterState, LimitedFilter};
 pub use ik::{IkConfig, JointReference, JointStep};

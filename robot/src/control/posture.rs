@@ -12,7 +12,7 @@ use super::ik::{largest_share, min_eigenvalue, orientation_error, resolve};
 pub(super) const ACCELERATION_CAP: f64 = 30.0;
 
 /// Speed, acceleration and jerk of the tip that every direction allows at a posture.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct CartesianLimits {
     /// m/s.
     pub v_max: f64,

@@ -3,7 +3,9 @@
 use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
-use telemime_sim::arm::{ArmModel, Joints, Kinematics, LoadOptions, Plant, default_urdf};
+use telemime_sim::arm::{
+    ArmModel, ContactPlane, Joints, Kinematics, LoadOptions, Plant, default_urdf,
+};
 
 use super::*;
 
@@ -115,7 +117,14 @@ fn holds_its_start_under_gravity() {
 
 #[test]
 fn a_demand_far_outside_keeps_every_joint_within_limits() {
-    let mut rig = rig(&ControlConfig::default());
+    // The straight way back leads through the arm itself: kept apart, it is led aside until three joints are at their stops, and waits there.
+    let mut rig = rig(&ControlConfig {
+        barrier: BarrierConfig {
+            self_collision: false,
+            ..BarrierConfig::default()
+        },
+        ..ControlConfig::default()
+    });
     let directions = [
         Vector3::new(5.0, 0.0, 0.0),
         Vector3::new(-5.0, 1.0, 0.0),
@@ -141,14 +150,14 @@ fn a_demand_far_outside_keeps_every_joint_within_limits() {
             assert!(out.tau.iter().all(|x| x.is_finite()));
             for (i, joint) in joints.iter().enumerate() {
                 assert!(out.tau[i].abs() <= joint.effort);
-                assert!(out.q_ref[i] >= joint.lower && out.q_ref[i] <= joint.upper);
-                let asked = (out.q_ref[i] - last_ref[i]).abs() / DT;
+                assert!(out.setpoint.q[i] >= joint.lower && out.setpoint.q[i] <= joint.upper);
+                let asked = (out.setpoint.q[i] - last_ref[i]).abs() / DT;
                 assert!(asked <= joint.velocity * (1.0 + 1e-9), "{asked}");
                 // Measured speed may exceed it while torque is cut.
                 let speed = rig.plant.qd()[i].abs();
                 assert!(speed <= joint.velocity * 1.25, "{}: {speed}", joint.name);
             }
-            last_ref = out.q_ref;
+            last_ref = out.setpoint.q;
         }
     }
     let counts = rig.controller.counts();
@@ -226,7 +235,7 @@ fn jumps(seed: u64, every: usize, radius: f64) -> [(f64, f64); 2] {
             target = rig.start + direction.normalize() * radius;
         }
         let out = rig.follow(target);
-        kinematics.update(&rig.arm, &out.q_ref);
+        kinematics.update(&rig.arm, &out.setpoint.q);
         tips[0].push(kinematics.tip());
         tips[1].push(out.tip);
         let beyond = (out.tip - rig.start).norm() - radius;
@@ -287,7 +296,7 @@ fn limits_of_turning_hold_at_the_tip_wherever_the_target_turns() {
                 speed_scale: 1.0,
             });
             off = off.max((out.tip - out.reference.p).norm());
-            kinematics.update(&rig.arm, &out.q_ref);
+            kinematics.update(&rig.arm, &out.setpoint.q);
             let asked = super::ik::quaternion(kinematics.tip_rotation());
             for (i, now) in [asked, out.orientation].into_iter().enumerate() {
                 let (last, speed) = before[i];
@@ -647,4 +656,56 @@ fn a_dead_time_of_the_torque_would_need_a_slow_loop() {
     settles(0.01, 40.0);
     settles(0.02, 20.0);
     settles(0.05, 8.0);
+}
+
+#[test]
+fn a_tip_pressed_on_a_surface_stays_on_it_and_comes_off() {
+    let mut rig = rig(&ControlConfig::default());
+    let surface_m = rig.start.z - 0.05;
+    let surface = ContactPlane::new(Vector3::z(), surface_m).unwrap();
+    rig.plant = rig.plant.clone().beside(Some(surface));
+    let into = rig.start + Vector3::new(0.02, 0.03, -0.08);
+    let (mut deepest, mut hardest_n) = (0.0_f64, 0.0_f64);
+    for _ in 0..3000 {
+        let out = rig.follow(into);
+        deepest = deepest.max(surface_m - out.tip.z);
+        hardest_n = hardest_n.max(rig.plant.contact_force().norm());
+    }
+    println!(
+        "pressed: {:.2} mm deep, {hardest_n:.0} N at most, {:.0} N at the end",
+        deepest * 1e3,
+        rig.plant.contact_force().z
+    );
+    assert!(rig.plant.contact_force().z > 10.0 && hardest_n < 1000.0);
+    assert!(deepest < 0.04 && rig.plant.qd().amax() < 0.01);
+    let mut tip = Vector3::zeros();
+    for _ in 0..2000 {
+        tip = rig.follow(rig.start).tip;
+    }
+    assert!((tip - rig.start).norm() < 1e-3, "{tip}");
+    assert_eq!(rig.plant.contact_force(), Vector3::zeros());
+}
+
+#[test]
+fn a_payload_that_is_known_is_carried_and_one_too_heavy_refused() {
+    let with = |payload: &str| {
+        let options = LoadOptions {
+            payload: Some(payload.parse().unwrap()),
+            ..LoadOptions::default()
+        };
+        let arm = Arc::new(ArmModel::from_urdf(default_urdf(), &options).unwrap());
+        let home = home_posture(&arm);
+        Controller::new(Arc::clone(&arm), &ControlConfig::default(), &home)
+            .map(|controller| (controller, Plant::new(arm, &home).unwrap(), home))
+    };
+    let (mut controller, mut plant, home) = with("1.5@0,0,0.05").unwrap();
+    for _ in 0..1000 {
+        let out = controller.tick(Demand::Stop, plant.q(), plant.qd());
+        plant.step(&out.tau, DT);
+    }
+    assert!((plant.q() - home).norm() < 1e-5);
+    let bare = *rig(&ControlConfig::default()).controller.limits();
+    assert!(controller.limits().a_max < bare.a_max);
+    let error = with("30").unwrap_err();
+    assert!(matches!(error, ControlError::TooWeak { .. }), "{error}");
 }

@@ -3,6 +3,7 @@
 use core::f64::consts::{PI, TAU};
 
 use nalgebra::{UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
 use telemime_sim::arm::{ArmModel, Dynamics, Joints};
 
 use super::ik::turning_rates;
@@ -23,7 +24,7 @@ const SHARE: f64 = 0.5;
 const UNIT_TOLERANCE: f64 = 1e-3;
 
 /// Speed, acceleration and jerk of the tip's rotation, about any axis.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TurnLimits {
     /// rad/s.
     pub v_max: f64,
@@ -62,7 +63,7 @@ impl TurnLimits {
 }
 
 /// Orientation and its derivatives at the filter's output, in base axes.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct TurnState {
     /// Tip axes to base axes.
     pub orientation: UnitQuaternion<f64>,
@@ -101,6 +102,16 @@ impl TurnFilter {
     /// The configuration.
     pub fn config(&self) -> &FilterConfig {
         self.chart.config()
+    }
+
+    /// Goes on from `state`.
+    pub(super) fn restore(&mut self, state: TurnState) {
+        self.orientation = state.orientation;
+        self.chart.restore(FilterState {
+            p: Vector3::zeros(),
+            v: state.angular_velocity,
+            a: state.angular_acceleration,
+        });
     }
 
     /// The output.

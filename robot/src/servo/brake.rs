@@ -16,8 +16,8 @@ const CONNECTION_LOST: u8 = 16;
 pub struct Brake(Arc<AtomicU8>);
 
 /// What has been pulled since the last tick.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Pulled(u8);
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Pulled(u8);
 
 impl Brake {
     /// Emergency stop at the robot.
@@ -43,8 +43,18 @@ impl Brake {
 }
 
 impl Pulled {
+    /// As a number, for a record.
+    pub(crate) fn bits(self) -> u8 {
+        self.0
+    }
+
+    /// From such a number.
+    pub(crate) fn from_bits(bits: u8) -> Self {
+        Self(bits)
+    }
+
     /// The emergency stop, if one was pulled; the local one counts for more.
-    pub(super) fn stop(self) -> Option<Cause> {
+    pub fn stop(self) -> Option<Cause> {
         match self.0 {
             bits if bits & LOCAL_STOP != 0 => Some(Cause::LocalStop),
             bits if bits & OPERATOR_STOP != 0 => Some(Cause::OperatorStop),
@@ -53,7 +63,7 @@ impl Pulled {
     }
 
     /// The reason to hold, if there is one.
-    pub(super) fn hold(self) -> Option<Cause> {
+    pub fn hold(self) -> Option<Cause> {
         match self.0 {
             bits if bits & FAULT != 0 => Some(Cause::Fault),
             bits if bits & CLOCK_STEP != 0 => Some(Cause::ClockStep),

@@ -1,6 +1,7 @@
 //! From hand to tip: a stated, rigid mapping, scaled in its lengths, with a fresh reference at every engage.
 
 use nalgebra::{UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
 
 /// Where the tip may be: a ball around its place in the start posture, wherever it engages.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -25,7 +26,7 @@ impl Workspace {
 }
 
 /// `tip = tip₀ + s · R · (hand − hand₀)`, and for orientations `q_tip = R · (q_hand · q_hand₀⁻¹) · R⁻¹ · q_tip₀`: rotation is never scaled.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Mapping {
     /// Tip metres per hand metre.
     pub scale: f64,

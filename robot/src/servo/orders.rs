@@ -1,12 +1,16 @@
 //! What the session tells the servo, what it is told, and the rings between them.
 
+use std::sync::Arc;
+
 use nalgebra::{UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
 use telemime_endpoint::Mono;
 use telemime_protocol::checkpoint::PoseCurve;
 use telemime_protocol::predict::{Bend, Forecast, TurnForecast};
 use telemime_protocol::wire::v1::{Cause, RobotState};
 use telemime_sim::arm::Joints;
 
+use super::arm::ArmFault;
 use super::brake::Brake;
 use super::mapping::Mapping;
 
@@ -20,7 +24,7 @@ pub struct Trajectory {
 }
 
 /// What drives an engagement.
-#[derive(Debug)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[expect(
     clippy::large_enum_variant,
     reason = "a box would be allocated per message and freed on the tick"
@@ -38,11 +42,11 @@ pub enum Source {
         grip: Option<f64>,
     },
     /// A plan, from its beginning.
-    Play(Box<Trajectory>),
+    Play(#[serde(with = "super::played")] Arc<Trajectory>),
 }
 
 /// What the operator's hand makes of a plan, on the robot's clock.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Bent {
     /// When of the plan it is, and how far beside it.
     pub bend: Bend,
@@ -64,6 +68,11 @@ impl Bent {
             .offset_at(now.secs_since(self.at), now.secs_since(self.sampled_at))
     }
 
+    /// Whether its forecast can be read.
+    pub(crate) fn is_sound(&self) -> bool {
+        self.bend.held.is_none_or(|held| held.push.ahead.is_sound())
+    }
+
     /// Whether nothing bends the plan any more at `now`.
     pub fn is_over(&self, now: Mono) -> bool {
         self.bend.is_over(now.secs_since(self.at))
@@ -71,7 +80,7 @@ impl Bent {
 }
 
 /// Which engagement of which session.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ticket {
     /// The session's epoch, unique for the life of the daemon; 0 is none.
     pub epoch: u32,
@@ -81,7 +90,7 @@ pub struct Ticket {
 
 /// How long a message authorises motion, on the robot's clock and fixed when it arrived: what waits in a
 /// queue does not last longer for it.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Lease {
     /// When it arrived.
     pub from: Mono,
@@ -90,10 +99,12 @@ pub struct Lease {
 }
 
 /// A granted request to engage.
-#[derive(Debug)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Engagement {
     /// Whose it is.
     pub ticket: Ticket,
+    /// The hash of the skill that the session holds, if it holds one.
+    pub model: Option<[u8; 16]>,
     /// What drives.
     pub source: Source,
     /// Tip metres per hand metre.
@@ -105,7 +116,7 @@ pub struct Engagement {
 }
 
 /// What the session tells the servo. Stops are not among it: a [`Brake`] needs no queue.
-#[derive(Debug)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub enum Order {
     /// An operator has, or loses, authority.
     Operator(bool),
@@ -144,6 +155,22 @@ pub enum Order {
         /// The stop that is meant, by [`Report::transitions`]; `None` is whoever stands at the arm.
         stop: Option<u32>,
     },
+}
+
+impl Order {
+    /// Whether every forecast in it can be read: those of a session can, those of a file may be anything.
+    pub(crate) fn is_sound(&self) -> bool {
+        let turned = |turn: &Option<TurnForecast>| turn.is_none_or(|turn| turn.ahead.is_sound());
+        match self {
+            Self::Engage(engagement) => match &engagement.source {
+                Source::Mirror { forecast, turn, .. } => forecast.ahead.is_sound() && turned(turn),
+                Source::Play(_) => true,
+            },
+            Self::Track { forecast, turn, .. } => forecast.ahead.is_sound() && turned(turn),
+            Self::Extend { bent, .. } => bent.is_none_or(|bent| bent.is_sound()),
+            Self::Operator(_) | Self::Release(_) | Self::Reset { .. } => true,
+        }
+    }
 }
 
 /// What the servo tells the session after every tick.
@@ -189,6 +216,8 @@ pub struct Report {
     pub opening: f64,
     /// Joint positions.
     pub q: Joints,
+    /// What is wrong with the arm, or with what drives it.
+    pub fault: Option<ArmFault>,
     /// Ticks of this engagement on which a limit acted.
     pub clamps: u32,
 }
@@ -201,7 +230,7 @@ pub struct Rings {
     /// Reports to the session; dropped (and seen by their tick numbers) while it is full.
     pub reports: rtrb::Producer<Report>,
     /// Trajectories no longer needed, to be freed elsewhere.
-    pub spent: rtrb::Producer<Box<Trajectory>>,
+    pub spent: rtrb::Producer<Arc<Trajectory>>,
     /// Stops.
     pub brake: Brake,
 }
@@ -214,7 +243,7 @@ pub struct Handle {
     /// Reports from it.
     pub reports: rtrb::Consumer<Report>,
     /// Trajectories to free.
-    pub spent: rtrb::Consumer<Box<Trajectory>>,
+    pub spent: rtrb::Consumer<Arc<Trajectory>>,
     /// Stops.
     pub brake: Brake,
 }

@@ -10,6 +10,20 @@ pub struct TickStats {
     buckets: [u32; BUCKETS],
     count: u64,
     sum_ns: u64,
+    max_ns: u32,
+}
+
+/// What a [`TickStats`] comes to, ns.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub struct Quantiles {
+    /// Half are below this.
+    pub p50_ns: u32,
+    /// All but 1 % are.
+    pub p99_ns: u32,
+    /// All but 0.1 % are.
+    pub p999_ns: u32,
+    /// The largest, exactly.
+    pub max_ns: u32,
 }
 
 impl Default for TickStats {
@@ -18,6 +32,7 @@ impl Default for TickStats {
             buckets: [0; BUCKETS],
             count: 0,
             sum_ns: 0,
+            max_ns: 0,
         }
     }
 }
@@ -47,6 +62,18 @@ impl TickStats {
         self.buckets[bucket(work_ns)] += 1;
         self.count += 1;
         self.sum_ns += u64::from(work_ns);
+        self.max_ns = self.max_ns.max(work_ns);
+    }
+
+    /// Median, tails and maximum: quantiles are upper edges of their buckets, but never above the maximum.
+    pub fn quantiles(&self) -> Quantiles {
+        let at = |p| self.quantile_ns(p).min(self.max_ns);
+        Quantiles {
+            p50_ns: at(0.5),
+            p99_ns: at(0.99),
+            p999_ns: at(0.999),
+            max_ns: self.max_ns,
+        }
     }
 
     /// Ticks counted.
@@ -100,6 +127,11 @@ mod tests {
         near(0.5, 5_100.0);
         near(0.99, 40_000.0);
         near(1.0, 9_000_000.0);
+        let told = stats.quantiles();
+        assert_eq!(
+            (told.max_ns, told.p999_ns, told.p99_ns),
+            (9_000_000, 9_000_000, stats.quantile_ns(0.99))
+        );
         assert_eq!(stats.mean_ns(), (98 * 5_100 + 40_000 + 9_000_000) / 100);
     }
 }

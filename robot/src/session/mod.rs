@@ -480,7 +480,7 @@ impl Session {
                     return Err(Refusal::BadPlan);
                 }
                 (
-                    Source::Play(Box::new(Trajectory { curve, duration_s })),
+                    Source::Play(Arc::new(Trajectory { curve, duration_s })),
                     None,
                 )
             }
@@ -489,6 +489,7 @@ impl Session {
         self.mirror = mirror;
         self.order(Order::Engage(Engagement {
             ticket: self.ticket(),
+            model: self.skill.as_ref().map(|skill| skill.id().0),
             source,
             scale: f64::from(engage.scale),
             rotation,
@@ -555,7 +556,7 @@ impl Session {
         let Some(report) = self.report.filter(|r| r.state == RobotState::Stopped) else {
             return;
         };
-        if report.cause == Cause::LocalStop || report.transitions != changes {
+        if report.cause != Cause::OperatorStop || report.transitions != changes {
             return self.refuse(Refusal::NotYours);
         }
         self.order(Order::Reset {

@@ -83,6 +83,7 @@ fn report(state: RobotState) -> Report {
         opening: 1.0,
         q: Joints::zeros(),
         clamps: 0,
+        fault: None,
     }
 }
 

@@ -70,6 +70,23 @@ impl<T: Copy> DeadTime<T> {
         self.line.fill(rest);
     }
 
+    /// What is on its way, what is due next first, into `line` in place of what that holds.
+    pub fn save(&self, line: &mut Vec<T>) {
+        line.clear();
+        line.extend_from_slice(&self.line[self.next..]);
+        line.extend_from_slice(&self.line[..self.next]);
+    }
+
+    /// Puts `line`, what is due next first, on its way; says whether it is as long as the dead time.
+    pub fn restore(&mut self, line: &[T]) -> bool {
+        let fits = line.len() == self.line.len();
+        if fits {
+            self.line.copy_from_slice(line);
+            self.next = 0;
+        }
+        fits
+    }
+
     /// What is on its way, in no particular order.
     pub fn on_its_way(&self) -> &[T] {
         &self.line

@@ -5,6 +5,9 @@ use nalgebra::{Matrix6, Vector3, Vector6};
 use super::kinematics::{cross_force, cross_motion, spatial};
 use super::{ArmModel, GRAVITY, Joints, Kinematics, MAX_JOINTS, MassMatrix};
 
+/// A joint that moves less than this, kg·m² (kg), has no acceleration of its own.
+const LEAST_PIVOT: f64 = 1e-12;
+
 /// Workspace for dynamics at one posture.
 ///
 /// Call [`update`](Self::update) with the joint values first; every other method then refers to that posture.
@@ -73,7 +76,7 @@ impl Dynamics {
 
     /// Joint accelerations (rad/s², m/s²) under the torques `tau` at velocity `qd`: the articulated-body algorithm
     /// (Featherstone 2008, table 7.1, in base coordinates). `added_inertia` ≥ 0 is added to the diagonal of the inertia
-    /// matrix: armature, or the step's implicit damping.
+    /// matrix: armature, or the step's implicit damping. A joint that moves no inertia at this posture is taken as one that does not accelerate.
     pub fn aba(&mut self, qd: &Joints, tau: &Joints, added_inertia: &Joints) -> Joints {
         let n = self.kinematics.dof;
         let mut v = Vector6::zeros();
@@ -85,16 +88,21 @@ impl Dynamics {
             self.articulated[i] = self.inertias[i];
         }
         let mut pulls = [Vector6::zeros(); MAX_JOINTS];
-        let (mut pivots, mut rest) = (Joints::zeros(), Joints::zeros());
+        let (mut inverses, mut rest) = (Joints::zeros(), Joints::zeros());
         for i in (0..n).rev() {
             let axis = &self.kinematics.axes[i];
             pulls[i] = self.articulated[i] * axis;
-            pivots[i] = axis.dot(&pulls[i]) + added_inertia[i];
+            let pivot = axis.dot(&pulls[i]) + added_inertia[i];
+            inverses[i] = if pivot > LEAST_PIVOT {
+                1.0 / pivot
+            } else {
+                0.0
+            };
             rest[i] = tau[i] - axis.dot(&self.forces[i]);
             if i > 0 {
-                let carried = self.articulated[i] - pulls[i] * (pulls[i] / pivots[i]).transpose();
+                let carried = self.articulated[i] - pulls[i] * (pulls[i] * inverses[i]).transpose();
                 let force =
-                    self.forces[i] + carried * self.biases[i] + pulls[i] * (rest[i] / pivots[i]);
+                    self.forces[i] + carried * self.biases[i] + pulls[i] * (rest[i] * inverses[i]);
                 self.articulated[i - 1] += carried;
                 self.forces[i - 1] += force;
             }
@@ -103,7 +111,7 @@ impl Dynamics {
         let mut a = spatial(Vector3::zeros(), -GRAVITY);
         for i in 0..n {
             a += self.biases[i];
-            qdd[i] = (rest[i] - pulls[i].dot(&a)) / pivots[i];
+            qdd[i] = (rest[i] - pulls[i].dot(&a)) * inverses[i];
             a += self.kinematics.axes[i] * qdd[i];
         }
         qdd

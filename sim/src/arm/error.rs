@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-use super::MAX_JOINTS;
+use super::{MAX_JOINTS, PayloadError};
 
 /// Why a URDF cannot be driven. Each message says what to change.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -96,6 +96,21 @@ pub enum ArmError {
         /// Of which link or joint.
         name: String,
     },
+    /// A number no arm has, which would overflow where it is squared.
+    #[error("{what} of `{name}` is {value:e}, more than {most:e}; correct the number")]
+    TooLarge {
+        /// Which quantity.
+        what: &'static str,
+        /// Of which link or joint.
+        name: String,
+        /// Its value.
+        value: f64,
+        /// The largest that is read.
+        most: f64,
+    },
+    /// A payload that no load has.
+    #[error(transparent)]
+    Payload(#[from] PayloadError),
     /// A joint that cannot move.
     #[error(
         "joint `{joint}` has the range [{lower}, {upper}]; give lower < upper, or make it continuous or fixed"
@@ -202,6 +217,11 @@ pub enum Notice {
         /// The joint.
         joint: String,
     },
+    /// A collision shape that is none: ignored.
+    ShapeIgnored {
+        /// The link.
+        link: String,
+    },
     /// No effort limit (or zero) is stated: torque is not limited.
     NoEffortLimit {
         /// The joint.
@@ -243,6 +263,12 @@ impl fmt::Display for Notice {
                 write!(f, "`{link}` has rotational inertia but no mass")
             }
             Self::MasslessBody { joint } => write!(f, "the body behind `{joint}` has no mass"),
+            Self::ShapeIgnored { link } => {
+                write!(
+                    f,
+                    "a collision shape of `{link}` has no usable size: ignored"
+                )
+            }
             Self::NoEffortLimit { joint } => {
                 write!(f, "`{joint}` states no effort limit: torque is not limited")
             }

@@ -97,20 +97,32 @@ impl Kinematics {
         j
     }
 
-    /// J̇q̇: the tip's acceleration (linear m/s², angular rad/s², base axes) at joint velocity `qd` and zero joint
-    /// acceleration.
-    pub fn bias_acceleration(&self, qd: &Joints) -> Vector6<f64> {
-        let mut v = Vector6::zeros();
-        let mut a = Vector6::zeros();
-        for (axis, qd) in self.axes[..self.dof].iter().zip(qd.iter()) {
-            let own = axis * *qd;
-            a += cross_motion(&v, &own);
-            v += own;
+    /// The time derivative of [`jacobian`](Self::jacobian) at joint velocity `qd`: with it the tip accelerates by J q̈ + J̇ q̇, the columns' linear part
+    /// being that of the tip's origin in base axes. Column i is that of the axis, v × sᵢ with v the spatial velocity of the body before it
+    /// (Featherstone 2008, eq. 2.30), moved to the tip, which moves itself.
+    pub fn jacobian_derivative(&self, qd: &Joints) -> Jacobian {
+        let (mut rates, mut velocity) = ([Vector6::zeros(); MAX_JOINTS], Vector6::zeros());
+        for (i, axis) in self.axes[..self.dof].iter().enumerate() {
+            rates[i] = cross_motion(&velocity, axis);
+            velocity += axis * qd[i];
         }
-        let ((w, v), (dw, dv)) = (halves(&v), halves(&a));
+        let (w, v) = halves(&velocity);
         let tip_velocity = v + w.cross(&self.tip);
-        let linear = dv + dw.cross(&self.tip) + w.cross(&tip_velocity);
-        Vector6::new(linear.x, linear.y, linear.z, dw.x, dw.y, dw.z)
+        let mut j = Jacobian::zeros();
+        for (i, rate) in rates[..self.dof].iter().enumerate() {
+            let (angular, linear) = halves(rate);
+            let (axis, _) = halves(&self.axes[i]);
+            let at_tip = linear + angular.cross(&self.tip) + axis.cross(&tip_velocity);
+            j.fixed_view_mut::<3, 1>(0, i).copy_from(&at_tip);
+            j.fixed_view_mut::<3, 1>(3, i).copy_from(&angular);
+        }
+        j
+    }
+
+    /// The velocity (m/s) of a point at `p` (base axes, m) that moves with joint `i`, per unit speed of joint `j` ≤ `i`.
+    pub fn point_rate(&self, j: usize, p: &Vector3<f64>) -> Vector3<f64> {
+        let (angular, linear) = halves(&self.axes[j]);
+        linear + angular.cross(p)
     }
 }
 

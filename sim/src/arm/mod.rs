@@ -1,16 +1,20 @@
-//! A serial manipulator from its URDF: kinematics, rigid-body dynamics, a plant that integrates them, and a gripper.
+//! A serial manipulator from its URDF: kinematics, rigid-body dynamics, a plant that integrates them, capsules around its links, and a gripper.
 //!
 //! Everything on the real-time path works on fixed arrays of [`MAX_JOINTS`] in workspaces that the caller
 //! owns ([`Kinematics`], [`Dynamics`]): nothing allocates after [`ArmModel::from_urdf`].
 //! The base frame is the URDF's root link; gravity is [`GRAVITY`] in it.
 
+mod capsule;
+mod contact;
 mod dead_time;
 mod dynamics;
 mod error;
 mod gripper;
+mod hull;
 mod inertia;
 mod kinematics;
 mod model;
+mod payload;
 mod plant;
 mod tree;
 mod urdf;
@@ -20,6 +24,10 @@ mod tests;
 
 use nalgebra::{SMatrix, SVector, Vector3};
 
+pub use capsule::{
+    Capsule, CapsuleSource, MAX_CAPSULES, Nearest, Proximity, SelfCollision, Unguarded,
+};
+pub use contact::{ContactError, ContactPlane, MAX_STIFFNESS_N_M};
 pub use dead_time::{DeadTime, DeadTimeError, MAX_DEAD_TIME_S};
 pub use dynamics::Dynamics;
 pub use error::{ArmError, Notice};
@@ -27,7 +35,8 @@ pub use gripper::{Gripper, GripperError};
 pub use inertia::Body;
 pub use kinematics::Kinematics;
 pub use model::{ArmModel, Joint, JointKind, LoadOptions};
-pub use plant::{Plant, PlantError, PlantReport, check_start};
+pub use payload::{Payload, PayloadError};
+pub use plant::{Integrator, Plant, PlantError, PlantReport, check_start};
 
 /// The largest number of moving joints between base and tip.
 pub const MAX_JOINTS: usize = 10;

@@ -1,5 +1,8 @@
 //! Against Pinocchio's figures, each checked with MuJoCo (tests/vectors/rigid_*.json).
 
+mod faults;
+mod physics;
+
 use std::sync::Arc;
 
 use nalgebra::{Isometry3, Matrix3, Translation3, UnitQuaternion, Vector3};
@@ -111,7 +114,7 @@ fn tip_velocity_and_acceleration() {
         let (qd, qdd) = (joints(&state["v"]), joints(&state["a"]));
         let k = dynamics.kinematics();
         let velocity = k.jacobian() * qd;
-        let acceleration = k.jacobian() * qdd + k.bias_acceleration(&qd);
+        let acceleration = k.jacobian() * qdd + k.jacobian_derivative(&qd) * qd;
         let v = list(&state["tip_vel_world_aligned"]);
         let a = list(&state["tip_acc_classical_world_aligned"]);
         for i in 0..6 {

@@ -1,12 +1,29 @@
 //! From a URDF's numbers to an [`ArmModel`].
 
-use nalgebra::{Isometry3, Matrix3, SymmetricEigen, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Translation3, UnitQuaternion, Vector3};
+use rand_xoshiro::Xoshiro256PlusPlus;
+use rand_xoshiro::rand_core::SeedableRng;
 use urdf_rs::{JointType, Pose};
 
+use super::capsule::random_posture;
+use super::hull::Hulls;
+use super::payload::moments;
 use super::tree::{Tree, moves};
 use super::{
     ArmError, ArmModel, Body, Dynamics, Joint, JointKind, Joints, LoadOptions, MAX_JOINTS, Notice,
 };
+
+/// No link is longer, m.
+const MAX_LENGTH_M: f64 = 100.0;
+
+/// No body is heavier, kg, nor its inertia larger, kg·m².
+const MAX_MASS: f64 = 1e6;
+
+/// No joint rubs harder, N·m·s/rad and N·m (N·s/m and N).
+const MAX_RESISTANCE: f64 = 1e9;
+
+/// A joint's range that ends farther away has no end, rad or m.
+const NO_END: f64 = 1e6;
 
 pub(super) fn read(text: &str, options: &LoadOptions) -> Result<ArmModel, ArmError> {
     let robot = urdf_rs::read_from_string(text).map_err(|e| ArmError::Parse {
@@ -55,10 +72,13 @@ pub(super) fn read(text: &str, options: &LoadOptions) -> Result<ArmModel, ArmErr
     }
 
     let mut reader = Reader {
+        hulls: Hulls::default(),
         tree,
         options,
         notices,
     };
+    reader.hulls.begin(reader.tree.root);
+    reader.shapes(reader.tree.root, &Isometry3::identity())?;
     let mut joints: Vec<Joint> = Vec::with_capacity(count);
     let mut pose = Isometry3::identity();
     for (i, joint) in path.iter().enumerate() {
@@ -66,6 +86,7 @@ pub(super) fn read(text: &str, options: &LoadOptions) -> Result<ArmModel, ArmErr
         if moves(joint) {
             let mut checked = reader.joint(joint, pose * origin)?;
             pose = Isometry3::identity();
+            reader.hulls.begin(&joint.child.link);
             checked.body = reader.link_and_branches(&joint.child.link, pose, path.get(i + 1))?;
             if checked.body.mass_kg == 0.0 {
                 reader.notices.push(Notice::MasslessBody {
@@ -81,15 +102,21 @@ pub(super) fn read(text: &str, options: &LoadOptions) -> Result<ArmModel, ArmErr
             }
         }
     }
+    if let (Some(payload), Some(last)) = (&options.payload, joints.last_mut()) {
+        last.body = last.body.joined(&payload.body().moved(&pose));
+    }
     let turns = joints.iter().map(turns).collect();
-    let arm = ArmModel {
+    let Reader { hulls, notices, .. } = reader;
+    let mut arm = ArmModel {
         name: robot.name.clone(),
         tip: tip.to_owned(),
         joints,
         tip_offset: pose,
-        notices: reader.notices,
+        notices,
+        capsules: Vec::new(),
         turns,
     };
+    arm.capsules = hulls.capsules(&arm);
     refuse_massless(&arm)?;
     Ok(arm)
 }
@@ -98,9 +125,26 @@ struct Reader<'a> {
     tree: Tree<'a>,
     options: &'a LoadOptions,
     notices: Vec<Notice>,
+    hulls: Hulls,
 }
 
 impl Reader<'_> {
+    /// What a link at `pose` fills.
+    fn shapes(&mut self, link: &str, pose: &Isometry3<f64>) -> Result<(), ArmError> {
+        let Some(link) = self.tree.robot.links.iter().find(|l| l.name == link) else {
+            return Ok(());
+        };
+        for collision in &link.collision {
+            let pose = pose * isometry(&collision.origin, "a collision's origin", &link.name)?;
+            if !self.hulls.add(&link.name, &pose, &collision.geometry) {
+                self.notices.push(Notice::ShapeIgnored {
+                    link: link.name.clone(),
+                });
+            }
+        }
+        Ok(())
+    }
+
     /// A moving joint of the chain, without its body.
     fn joint(
         &mut self,
@@ -139,6 +183,7 @@ impl Reader<'_> {
             if !not_negative(what, value)?.is_finite() {
                 return Err(ArmError::NotFinite { what, name });
             }
+            at_most(what, &name, value, MAX_RESISTANCE)?;
         }
         let stated = |value: f64| {
             if value == 0.0 { f64::INFINITY } else { value }
@@ -176,6 +221,7 @@ impl Reader<'_> {
         pose: Isometry3<f64>,
         next: Option<&&urdf_rs::Joint>,
     ) -> Result<Body, ArmError> {
+        self.shapes(link, &pose)?;
         let mut body = self.link(link)?.moved(&pose);
         let mut open: Vec<(&urdf_rs::Joint, Isometry3<f64>)> = Vec::new();
         let off_chain = |j: &&urdf_rs::Joint| next.is_none_or(|n| n.name != j.name);
@@ -186,6 +232,7 @@ impl Reader<'_> {
             let pose = pose
                 * isometry(&joint.origin, "origin", &joint.name)?
                 * self.fixed_motion(joint)?;
+            self.shapes(&joint.child.link, &pose)?;
             body = body.joined(&self.link(&joint.child.link)?.moved(&pose));
             open.extend(
                 self.tree
@@ -280,8 +327,9 @@ impl Reader<'_> {
                 mass_kg,
             });
         }
-        let mut moments = SymmetricEigen::new(inertia).eigenvalues;
-        moments.as_mut_slice().sort_by(f64::total_cmp);
+        at_most("the mass", name, mass_kg, MAX_MASS)?;
+        at_most("the inertia", name, inertia.amax(), MAX_MASS)?;
+        let moments = moments(&inertia);
         let rounding = 1e-9 * moments[2].abs();
         if moments[0] < -rounding {
             return Err(ArmError::NegativeInertia {
@@ -339,7 +387,26 @@ fn limits(joint: &urdf_rs::Joint) -> Result<(f64, f64), ArmError> {
             upper,
         });
     }
-    Ok((lower, upper))
+    let end = |limit: f64| {
+        if limit.abs() > NO_END {
+            f64::INFINITY.copysign(limit)
+        } else {
+            limit
+        }
+    };
+    Ok((end(lower), end(upper)))
+}
+
+fn at_most(what: &'static str, name: &str, value: f64, most: f64) -> Result<(), ArmError> {
+    if value.abs() <= most {
+        return Ok(());
+    }
+    Err(ArmError::TooLarge {
+        what,
+        name: name.to_owned(),
+        value,
+        most,
+    })
 }
 
 fn axis(joint: &urdf_rs::Joint) -> Result<Vector3<f64>, ArmError> {
@@ -363,6 +430,9 @@ fn isometry(pose: &Pose, what: &'static str, name: &str) -> Result<Isometry3<f64
             name: name.to_owned(),
         });
     }
+    for value in [x, y, z] {
+        at_most(what, name, value, MAX_LENGTH_M)?;
+    }
     Ok(Isometry3::from_parts(
         Translation3::new(x, y, z),
         UnitQuaternion::from_euler_angles(roll, pitch, yaw),
@@ -375,19 +445,24 @@ fn turns(joint: &Joint) -> [Matrix3<f64>; 3] {
     [at_zero, at_zero * cross, at_zero * cross * cross]
 }
 
-/// Every joint must move some inertia, or forward dynamics divides by zero.
+/// Every joint must move some inertia, or forward dynamics divides by zero: looked at with all joints mid-range and in 32 postures more.
 fn refuse_massless(arm: &ArmModel) -> Result<(), ArmError> {
     let mut dynamics = Dynamics::new();
-    dynamics.update(arm, &arm.per_joint(Joint::mid));
-    let pivots = dynamics.pivots(&Joints::zeros());
     let mass = arm.moving_mass_kg();
-    for (joint, pivot) in arm.joints.iter().zip(pivots.iter()) {
-        // 1 µg, or 1 µg at 1 m: below what any arm has, above what rounding leaves.
-        if !(*pivot > 1e-9 * mass.max(1.0)) {
-            return Err(ArmError::Massless {
-                joint: joint.name.clone(),
-            });
+    let mut rng = Xoshiro256PlusPlus::seed_from_u64(1);
+    let mut posture = arm.per_joint(Joint::mid);
+    for _ in 0..33 {
+        dynamics.update(arm, &posture);
+        let pivots = dynamics.pivots(&Joints::zeros());
+        for (joint, pivot) in arm.joints.iter().zip(pivots.iter()) {
+            // 1 µg, or 1 µg at 1 m: below what any arm has, above what rounding leaves.
+            if !(*pivot > 1e-9 * mass.max(1.0)) {
+                return Err(ArmError::Massless {
+                    joint: joint.name.clone(),
+                });
+            }
         }
+        posture = random_posture(arm, &mut rng);
     }
     Ok(())
 }

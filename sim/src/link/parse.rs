@@ -311,8 +311,7 @@ impl<'a> Parser<'a> {
         match option {
             "limit" => {
                 let word = self.value(option, "a number of packets")?;
-                let limit: u32 = whole(option, word)?;
-                self.config.limit = limit as usize;
+                self.config.limit = whole(option, word)?;
             }
             "delay" => {
                 self.config.delay_s = self.time(option)?;

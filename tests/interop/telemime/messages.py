@@ -27,7 +27,7 @@ class Knots(Bytes):
 STATES = Enum("Idle", "Ready", "Engaged", "Coasting", "Holding", "Stopped")
 CAUSES = Enum(
     "Requested", "NewsArrived", "NewsLate", "LeaseExpired", "PlanFinished",
-    "ConnectionLost", "OperatorStop", "LocalStop", "ClockStep", "Fault",
+    "ConnectionLost", "OperatorStop", "LocalStop", "ClockStep", "Fault", "ArmFault",
 )  # fmt: skip
 REASONS = Enum(
     "Stopped", "AlreadyEngaged", "OldEngagement", "StaleReference", "ClockUnknown", "BadModel",

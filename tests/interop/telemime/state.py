@@ -12,7 +12,6 @@ PLACE, MEMORY, ANGLE, TURN_MEMORY = 1e-4, 25e-6, 1e-4, 25e-6
 def _state_ranges(s):
     require(abs(s["t_us"]) <= (2**63 - 1) // 1000, "t_us", s["t_us"])
     require(all(abs(n) <= 1_000_000 for n in s["x"]), "x", s["x"])
-    require(s["memory_exponent"] <= 20, "memory_exponent", s["memory_exponent"])
 
 
 def _rotation_range(name):
@@ -21,9 +20,7 @@ def _rotation_range(name):
 
 def _turn_ranges(s):
     _rotation_range("q")(s)
-    require(s["memory_exponent"] <= 10, "memory_exponent", s["memory_exponent"])
-
-
+    require(all(e <= 10 for e in exponents(s["memory"])), "memory", s["memory"])
 
 
 def _weights(p):
@@ -32,13 +29,20 @@ def _weights(p):
 
 PARAMS = Struct(("gain", U8), ("inflation", U8), ("weights", Array(Array(U8, 3), 3)), check=_weights)
 ROTATION = Array(I16, 3)
-STATE = Struct(
-    ("t_us", I64), ("x", Array(I32, 3)), ("memory_exponent", U8), ("memory", Array(Array(I8, 3), 4)), check=_state_ranges
-)
-TURN = Struct(
-    ("q", ROTATION), ("memory_exponent", U8), ("memory", Array(Array(I8, 3), 4)), ("params", PARAMS), check=_turn_ranges
-)
+MEMORIES = Struct(("exponents", Array(U8, 2)), ("offsets", Array(Array(I8, 3), 4)))
+STATE = Struct(("t_us", I64), ("x", Array(I32, 3)), ("memory", MEMORIES), check=_state_ranges)
+TURN = Struct(("q", ROTATION), ("memory", MEMORIES), ("params", PARAMS), check=_turn_ranges)
 POSE = Struct(("turn", Option(TURN)), ("grip", Option(U8)))
+
+
+def exponents(memory):
+    """Of each of the four, first the high half of a byte."""
+    return [half for byte in memory["exponents"] for half in (byte >> 4, byte & 15)]
+
+
+def remembered(memory, unit):
+    """The four vectors, in units of 1."""
+    return [[unit * 2.0**e * n for n in row] for e, row in zip(exponents(memory), memory["offsets"])]
 
 
 class Hand:
@@ -50,20 +54,19 @@ class Hand:
 
     @classmethod
     def of_wire(cls, w):
-        step = MEMORY * 2.0 ** w["memory_exponent"]
         x = [PLACE * n for n in w["x"]]
-        return cls(w["t_us"] * 1e-6, x, [[a - step * n for a, n in zip(x, row)] for row in w["memory"]])
+        return cls(w["t_us"] * 1e-6, x, [[a - b for a, b in zip(x, way)] for way in remembered(w["memory"], MEMORY)])
 
     def wire(self):
-        """As it travels: the least exponent for which every component fits."""
+        """As it travels: for each memory the least exponent for which every component fits."""
         x = [round_away(a / PLACE) for a in self.x]
-        place = [PLACE * n for n in x]
-        apart = [[a - b for a, b in zip(place, m)] for m in self.m]
-        for e in range(21):
-            rows = [[round_away(d / (MEMORY * 2.0**e)) for d in row] for row in apart]
-            if all(abs(n) <= 127 for row in rows for n in row):
-                break
-        return {"t_us": round_away(self.t * 1e6), "x": x, "memory_exponent": e, "memory": rows}
+        steps, rows = [], []
+        for m in self.m:
+            way = [a - b for a, b in zip(self.x, m)]
+            steps.append(next(e for e in range(16) if max(map(abs, way)) <= 127 * MEMORY * 2.0**e))
+            rows.append([round_away(d / (MEMORY * 2.0 ** steps[-1])) for d in way])
+        packed = [steps[0] << 4 | steps[1], steps[2] << 4 | steps[3]]
+        return {"t_us": round_away(self.t * 1e6), "x": x, "memory": {"exponents": packed, "offsets": rows}}
 
     def step(self, t):
         """(e, r) of each memory for a next sample at t."""
@@ -91,9 +94,9 @@ class Turn:
 
     @classmethod
     def of_wire(cls, w):
-        step = TURN_MEMORY * 2.0 ** w["memory_exponent"]
         q = rotation.exp([ANGLE * n for n in w["q"]])
-        return cls(q, [rotation.mul(q, rotation.exp([-step * n for n in row])) for row in w["memory"]])
+        ways = remembered(w["memory"], TURN_MEMORY)
+        return cls(q, [rotation.mul(q, rotation.exp([-n for n in way])) for way in ways])
 
     def next(self, hand, t, q):
         """After a later sample; `hand` is the hand's state before it."""

@@ -212,27 +212,32 @@ fn refine<const D: usize>(
 ) -> Result<(), CheckpointError> {
     leave_out(search, kept, bound, REFINING_EFFORT, &mut accept)?;
     // Then the one whose loss costs least, the others moved to make up for it.
+    let (mut costs, mut order): (Vec<(f64, usize)>, Vec<usize>) = (Vec::new(), Vec::new());
+    let mut before = Vec::new();
     while kept.len() > 2 && search.effort < REFINING_EFFORT {
-        let mut costs: Vec<(f64, usize)> = Vec::new();
+        costs.clear();
         for j in 1..kept.len() - 1 {
             if search.effort >= REFINING_EFFORT {
                 return Ok(());
             }
-            let mut without = kept.clone();
-            without.remove(j);
-            costs.push((search.fit(&without, bound, 4.0 * bound), j));
+            let left_out = kept.remove(j);
+            costs.push((search.fit(kept, bound, 4.0 * bound), j));
+            kept.insert(j, left_out);
         }
         costs.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut dropped = false;
         for &(error_m, j) in costs.iter().take(6) {
-            let mut without = kept.clone();
-            without.remove(j);
-            if error_m.is_finite() && relocate(search, &mut without, error_m, j, bound) {
-                *kept = without;
+            if !error_m.is_finite() {
+                break;
+            }
+            before.clone_from(kept);
+            kept.remove(j);
+            if relocate(search, kept, &mut order, error_m, j, bound) {
                 accept(search, kept)?;
                 dropped = true;
                 break;
             }
+            kept.clone_from(&before);
         }
         if !dropped {
             break;
@@ -246,6 +251,7 @@ fn refine<const D: usize>(
 fn relocate<const D: usize>(
     search: &mut Search<'_, D>,
     kept: &mut [usize],
+    order: &mut Vec<usize>,
     mut error_m: f64,
     gap: usize,
     bound: f64,
@@ -253,12 +259,13 @@ fn relocate<const D: usize>(
     if error_m <= bound {
         return search.fit(kept, bound, bound) <= bound;
     }
-    let mut order: Vec<usize> = (1..kept.len() - 1).collect();
+    order.clear();
+    order.extend(1..kept.len() - 1);
     order.sort_by_key(|&j| (2 * j + 1).abs_diff(2 * gap));
     let mut moved = true;
     while moved && search.effort < REFINING_EFFORT {
         moved = false;
-        for &j in &order {
+        for &j in order.iter() {
             if search.effort >= REFINING_EFFORT {
                 return false;
             }

@@ -49,6 +49,8 @@ pub(super) struct Search<'a, const D: usize> {
     errors: Vec<f64>,
     /// The values of the best fit of the last trial.
     values: Vec<SVector<f64, D>>,
+    /// Those of the best round so far.
+    best: Vec<SVector<f64, D>>,
     /// Sample evaluations so far.
     pub(super) effort: usize,
 }
@@ -80,6 +82,7 @@ impl<'a, const D: usize> Search<'a, D> {
             weights: Vec::new(),
             errors: Vec::new(),
             values: Vec::new(),
+            best: Vec::new(),
             effort: 0,
         }
     }
@@ -163,7 +166,8 @@ impl<'a, const D: usize> Search<'a, D> {
         let n = self.motion.t.len();
         self.weights.clear();
         self.weights.resize(n, 1.0);
-        let mut best = (f64::INFINITY, Vec::new());
+        let mut least = f64::INFINITY;
+        self.best.clear();
         for round in 0..ROUNDS {
             self.effort += 2 * n;
             if !self.squares.solve(self.motion.y, &self.weights) {
@@ -198,16 +202,17 @@ impl<'a, const D: usize> Search<'a, D> {
             }
             self.values.clear();
             self.values.extend(self.squares.at_knots());
-            let error_m = self.decode(best.0);
-            if error_m < best.0 {
-                best = (error_m, self.values.clone());
+            let error_m = self.decode(least);
+            if error_m < least {
+                least = error_m;
+                std::mem::swap(&mut self.best, &mut self.values);
             }
-            if best.0 <= goal {
+            if least <= goal {
                 break;
             }
         }
-        self.values = best.1;
-        best.0
+        std::mem::swap(&mut self.best, &mut self.values);
+        least
     }
 
     /// The sum of squares of the least-squares curve, not quantised.

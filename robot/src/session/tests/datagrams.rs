@@ -55,7 +55,6 @@ fn what_is_foreign_malformed_or_impossible_is_dropped_and_counted() {
         motion(|m| m.engagement = 0),
         motion(|m| m.engagement = 2),
         motion(|m| m.state.x[1] = 2_000_000),
-        motion(|m| m.state.memory_exponent = 21),
         motion(|m| m.state.t_us = i64::MIN),
         // Later than now by more than a clock can be off.
         motion(|m| m.state.t_us += 700_000),

@@ -1,0 +1,23 @@
+//! The black box: all that the servo was told and decided in the last minutes, and the same again from a file.
+//!
+//! A [`Tap`] on the tick copies its inputs and outcome into rings; a [`Recorder`] elsewhere keeps them, a second to a chunk that begins with the
+//! core's whole state, and lets go of the oldest. [`file`](self::file) writes them; [`replay`] runs the same core on them again.
+
+pub mod file;
+mod recorder;
+pub mod replay;
+mod tap;
+mod thread;
+mod ticks;
+
+#[cfg(test)]
+mod tests;
+
+pub use self::replay::{Difference, Moment, Replay, ReplayError, Row, replay};
+pub use file::{BlackBox, Header, ReadError, WriteError};
+pub use recorder::{Due, Feed, Recorder};
+pub use tap::{Tap, Ticked, taps};
+pub use thread::{Asker, Keeper, Saved};
+
+/// What is kept, s: two minutes.
+pub const SPAN_S: f64 = 120.0;

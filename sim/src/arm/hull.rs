@@ -1,0 +1,194 @@
+//! From a URDF's collision shapes to capsules, and capsules where there are none.
+
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use urdf_rs::Geometry;
+
+use super::capsule::{Capsule, CapsuleSource, MAX_CAPSULES};
+use super::payload::moments;
+use super::{ArmModel, Body};
+
+/// Sizes beyond this are no shape, m.
+const MAX_SIZE_M: f64 = 100.0;
+
+/// Shapes as they are met, body by body.
+#[derive(Default)]
+pub(super) struct Hulls {
+    shapes: Vec<Capsule>,
+    /// Bodies of which a part is a mesh, which is not read.
+    meshed: Vec<usize>,
+    /// The first link of each body, base first.
+    links: Vec<String>,
+}
+
+impl Hulls {
+    /// Begins the next body with its first link, base first.
+    pub(super) fn begin(&mut self, link: &str) {
+        self.links.push(link.to_owned());
+    }
+
+    /// Adds the smallest capsule about a shape's own axis, given in the frame of the body begun last; false if the shape has no usable size.
+    pub(super) fn add(&mut self, link: &str, pose: &Isometry3<f64>, geometry: &Geometry) -> bool {
+        let body = self.links.len() - 1;
+        let x_up = UnitQuaternion::rotation_between(&Vector3::z(), &Vector3::x());
+        let y_up = UnitQuaternion::rotation_between(&Vector3::z(), &Vector3::y());
+        let (turn, half, radius) = match geometry {
+            Geometry::Mesh { .. } => {
+                self.meshed.push(body);
+                return true;
+            }
+            Geometry::Sphere { radius } => (None, 0.0, *radius),
+            Geometry::Capsule { radius, length } | Geometry::Cylinder { radius, length } => {
+                (None, 0.5 * length, *radius)
+            }
+            Geometry::Box { size } => {
+                let [x, y, z] = size.0;
+                let (turn, long, a, b) = if z >= x && z >= y {
+                    (None, z, x, y)
+                } else if x >= y {
+                    (x_up, x, y, z)
+                } else {
+                    (y_up, y, x, z)
+                };
+                if !(a.min(b) > 0.0) {
+                    return false;
+                }
+                (turn, 0.5 * long, 0.5 * a.hypot(b))
+            }
+        };
+        if !(radius > 0.0 && radius <= MAX_SIZE_M && (0.0..=MAX_SIZE_M).contains(&half)) {
+            return false;
+        }
+        let pose = pose * turn.unwrap_or_default();
+        self.shapes
+            .push(Capsule::around(body, link, &pose, half, radius));
+        true
+    }
+
+    /// All capsules of `arm`, base first: its shapes, less those inside another of the same body, and where a body has none, or a mesh, a derived one.
+    pub(super) fn capsules(self, arm: &ArmModel) -> Vec<Capsule> {
+        let mut out: Vec<Capsule> = Vec::new();
+        for body in 0..=arm.dof() {
+            let mut own: Vec<Capsule> = self
+                .shapes
+                .iter()
+                .filter(|c| c.body == body)
+                .cloned()
+                .collect();
+            if own.is_empty() || self.meshed.contains(&body) {
+                own.push(derived(arm, body, &self.links[body]));
+            }
+            own.sort_by(|a, b| b.radius_m.total_cmp(&a.radius_m));
+            let mut kept: Vec<Capsule> = Vec::new();
+            for capsule in own {
+                if !kept.iter().any(|k| k.contains(&capsule)) {
+                    kept.push(capsule);
+                }
+            }
+            // Every later body has room for one.
+            kept.truncate(MAX_CAPSULES - out.len() - (arm.dof() - body));
+            out.extend(kept);
+        }
+        out
+    }
+}
+
+/// See [`CapsuleSource::Derived`].
+fn derived(arm: &ArmModel, body: usize, link: &str) -> Capsule {
+    let joints = arm.joints();
+    let chain_m = arm.chain_length_m();
+    let b = match joints.get(body) {
+        Some(next) => next.placement.translation.vector,
+        None => arm.tip_offset().translation.vector,
+    };
+    let radius_m = match body.checked_sub(1) {
+        None => 0.05 * chain_m,
+        Some(i) => radius(&joints[i].body, chain_m),
+    };
+    Capsule {
+        body,
+        link: link.to_owned(),
+        a: Vector3::zeros(),
+        b,
+        radius_m,
+        source: CapsuleSource::Derived,
+    }
+}
+
+fn radius(body: &Body, chain_m: f64) -> f64 {
+    let [least, ..] = moments(&body.inertia_kg_m2);
+    let solid = (2.0 * least / body.mass_kg).sqrt();
+    if solid > 0.0 && solid.is_finite() {
+        solid.clamp(0.02 * chain_m, 0.1 * chain_m)
+    } else {
+        0.05 * chain_m
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::arm::{LoadOptions, Notice};
+
+    fn load(collisions: &str) -> ArmModel {
+        let urdf = format!(
+            r#"<robot name="r"><link name="b"/><link name="l"><inertial><mass value="1"/><inertia ixx=".1" ixy="0" ixz="0" iyy=".1" iyz="0" izz=".1"/></inertial>{collisions}</link><link name="tcp"/>
+            <joint name="j" type="continuous"><parent link="b"/><child link="l"/><origin xyz="0 0 .5"/><axis xyz="0 0 1"/></joint>
+            <joint name="t" type="fixed"><parent link="l"/><child link="tcp"/><origin xyz="1 0 0"/></joint></robot>"#
+        );
+        ArmModel::from_urdf(&urdf, &LoadOptions::default()).unwrap()
+    }
+
+    fn shape(geometry: &str, xyz: &str) -> String {
+        format!(
+            r#"<collision><origin xyz="{xyz}" rpy="0 1.5707963267948966 0"/><geometry>{geometry}</geometry></collision>"#
+        )
+    }
+
+    #[test]
+    fn shapes_are_enclosed_and_what_lies_inside_another_is_left_out() {
+        let cylinder = shape(r#"<cylinder radius=".1" length=".8"/>"#, ".4 0 0");
+        let inside = shape(r#"<sphere radius=".1"/>"#, ".8 0 0");
+        let arm = load(&(cylinder + &inside));
+        let own: Vec<_> = arm.capsules().iter().filter(|c| c.body == 1).collect();
+        assert_eq!(own.len(), 1);
+        assert_eq!(own[0].source, CapsuleSource::Geometry);
+        assert!((own[0].a.x.min(own[0].b.x)).abs() < 1e-12);
+        assert!((own[0].a.x.max(own[0].b.x) - 0.8).abs() < 1e-12);
+        assert_eq!(own[0].radius_m, 0.1);
+
+        for size in [".6 .03 .04", ".03 .6 .04", ".03 .04 .6"] {
+            let arm = load(&shape(&format!(r#"<box size="{size}"/>"#), "0 0 0"));
+            let own = arm.capsules().iter().find(|c| c.body == 1).unwrap();
+            assert!((own.radius_m - 0.025).abs() < 1e-12, "{size}");
+            assert!(((own.a - own.b).norm() - 0.6).abs() < 1e-12, "{size}");
+        }
+    }
+
+    #[test]
+    fn meshes_add_a_derived_capsule_and_shapes_without_size_are_named() {
+        let mesh = shape(r#"<mesh filename="x.stl"/>"#, "0 0 0");
+        let ball = shape(r#"<sphere radius=".5"/>"#, "0 0 2");
+        let arm = load(&(mesh + &ball));
+        let own: Vec<_> = arm.capsules().iter().filter(|c| c.body == 1).collect();
+        let derived = own
+            .iter()
+            .find(|c| c.source == CapsuleSource::Derived)
+            .unwrap();
+        assert_eq!((own.len(), derived.b), (2, Vector3::new(1.0, 0.0, 0.0)));
+        let flat = load(&shape(r#"<box size="1 1 0"/>"#, "0 0 0"));
+        assert!(
+            flat.notices()
+                .contains(&Notice::ShapeIgnored { link: "l".into() })
+        );
+        let base = &arm.capsules()[0];
+        assert_eq!((base.body, base.b), (0, Vector3::new(0.0, 0.0, 0.5)));
+    }
+
+    #[test]
+    fn no_arm_has_more_capsules_than_there_is_room_for() {
+        let many: String = (0..60)
+            .map(|i| shape(r#"<sphere radius=".01"/>"#, &format!("{i} 0 0")))
+            .collect();
+        assert_eq!(load(&many).capsules().len(), MAX_CAPSULES);
+    }
+}

@@ -1,0 +1,183 @@
+use std::path::Path;
+
+use super::*;
+
+/// One person who learned from two performances, everybody who follows, one of the runs without a link.
+const PLAN: &str = "\
+title = \"A & B\"
+seed = 3
+[motion]
+people = 1
+performances = 2
+[factors]
+method = [\"ours\", \"hold\", \"kalman\", \"playback\", \"floor\"]
+link = [\"delay 40ms 4ms loss 2%\", \"delay 80ms 8ms loss 2%\"]
+[[case]]
+[[case]]
+motion = \"on-model\"
+method = \"ours\"
+outage = \"2s..9s\"
+";
+
+fn args(plan: &Path, out: &Path, shard: &str, threads: u16) -> Args {
+    Args {
+        what: None,
+        plan: Some(plan.display().to_string()),
+        out: Some(out.to_owned()),
+        shard: shard.parse().unwrap(),
+        threads: Some(threads),
+        dry_run: false,
+        list: false,
+        print: None,
+        json: false,
+    }
+}
+
+/// Every file but the timing, by name.
+fn bytes(dir: &Path) -> Vec<(String, Vec<u8>)> {
+    let mut all = Vec::new();
+    for folder in [dir.to_owned(), dir.join("series")] {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            let name = path.strip_prefix(dir).unwrap().display().to_string();
+            if path.is_file() && name != "timing.json" {
+                all.push((name, std::fs::read(path).unwrap()));
+            }
+        }
+    }
+    all.sort();
+    all
+}
+
+#[test]
+fn the_same_plan_gives_the_same_bytes_on_any_number_of_threads_in_parts_and_interrupted() {
+    let scratch = tempfile::tempdir().unwrap();
+    let at = |name: &str| scratch.path().join(name);
+    let plan = at("plan.toml");
+    std::fs::write(&plan, PLAN).unwrap();
+    run(&args(&plan, &at("once"), "1/1", 2)).unwrap();
+    let once = bytes(&at("once"));
+    let names: Vec<&str> = once.iter().map(|(name, _)| name.as_str()).collect();
+    assert!(
+        names.contains(&"results.csv") && names.contains(&"manifest.json"),
+        "{names:?}"
+    );
+    assert!(!names.contains(&"part.csv"), "{names:?}");
+
+    // Again, in two parts.
+    for part in ["1/2", "2/2"] {
+        run(&args(&plan, &at(&part.replace('/', "-")), part, 1)).unwrap();
+    }
+    let dirs = [at("1-2"), at("2-2")];
+    store::merge(&at("merged"), &dirs).unwrap();
+    assert!(bytes(&at("merged")) == once, "merged, it is another result");
+    let missing = store::merge(&at("half"), &dirs[..1]).unwrap_err();
+    assert!(missing.to_string().contains("is in none"), "{missing}");
+
+    // Interrupted while the third run was being written.
+    let results = std::fs::read_to_string(at("once").join(store::RESULTS)).unwrap();
+    let lines: Vec<&str> = results.split_inclusive('\n').collect();
+    std::fs::create_dir_all(at("cut")).unwrap();
+    for name in [store::MANIFEST, store::PLAN] {
+        std::fs::copy(at("once").join(name), at("cut").join(name)).unwrap();
+    }
+    let third = &lines[3][..lines[3].len() / 2];
+    let part = [lines[1], lines[2], third].concat();
+    std::fs::write(at("cut").join("part.csv"), &part).unwrap();
+    std::fs::create_dir_all(at("cut").join("series")).unwrap();
+    run(&args(&plan, &at("cut"), "1/1", 2)).unwrap();
+    assert!(
+        bytes(&at("cut")) == once,
+        "gone on with, it is another result"
+    );
+
+    // A line that is none is not gone on with, and another plan overwrites nothing.
+    std::fs::remove_file(at("cut").join(store::RESULTS)).unwrap();
+    std::fs::write(at("cut").join("part.csv"), [lines[1], "1,2,3\n"].concat()).unwrap();
+    let refused = run(&args(&plan, &at("cut"), "1/1", 1)).unwrap_err();
+    assert!(
+        refused.to_string().contains("part.csv:2: not a result"),
+        "{refused}"
+    );
+    let other = at("other.toml");
+    std::fs::write(&other, PLAN.replace("seed = 3", "seed = 4")).unwrap();
+    let refused = run(&args(&other, &at("once"), "1/1", 1)).unwrap_err();
+    assert!(refused.to_string().contains("another plan"), "{refused}");
+
+    // What was run makes sense: the floor is lowest, holding is not best, and a link that stays away stops the arm.
+    let (_, _, rows) = store::read(&at("once")).unwrap();
+    let of = |method: &str, up: &str| {
+        let fits = |row: &&row::Row| {
+            let text = |name| factor::of(&row.texts, name);
+            text("method") == method
+                && text("motion") == "on-model"
+                && (text("up").starts_with(up) || text("up") == factor::UNUSED)
+                && text("outage") != "2s..9s"
+        };
+        rows.iter().find(fits).unwrap().figures
+    };
+    let rmse = |method, up| of(method, up).rmse_m.unwrap();
+    for up in ["delay 40ms", "delay 80ms"] {
+        assert!(rmse("floor", up) < rmse("ours", up));
+        assert!(rmse("ours", up) < rmse("hold", up));
+    }
+    assert!(rmse("hold", "delay 40ms") < rmse("hold", "delay 80ms"));
+    let held = of("hold", "delay 80ms");
+    assert!((held.delay_p50_s.unwrap() - 0.08).abs() < 3e-3);
+    let stopped: Vec<_> = rows
+        .iter()
+        .filter(|r| r.outcome.starts_with("stopped"))
+        .collect();
+    assert_eq!(stopped.len(), 2);
+    // One message may have been on its way; the lease is 0.65 s, and stopping takes a moment.
+    assert!(
+        stopped
+            .iter()
+            .all(|r| (0.4..1.6).contains(&r.figures.stop_s.unwrap()))
+    );
+
+    // The report, twice.
+    let page = |out: &Path| {
+        report::write(&at("once"), &out.join("report.html"), Some(out)).unwrap();
+        std::fs::read_to_string(out.join("report.html")).unwrap()
+    };
+    std::fs::create_dir_all(at("a")).unwrap();
+    std::fs::create_dir_all(at("b")).unwrap();
+    let html = page(&at("a"));
+    assert!(html == page(&at("b")), "another page");
+    let names = html.replace("http://www.w3.org/2000/svg", "");
+    for fetched in ["http:", "https:", "url(", "src=", "@import", "<script"] {
+        assert!(!names.contains(fetched), "{fetched}");
+    }
+    assert!(html.contains("<h1>A &amp; B</h1>") && !html.contains("NaN"));
+    for chart in [
+        "delay-on-model",
+        "delay-off-model",
+        "lag",
+        "age",
+        "timeline",
+        "calibration",
+    ] {
+        assert!(
+            html.contains(&format!("<figure id=\"{chart}\">")),
+            "{chart}"
+        );
+        for ending in ["svg", "png", "csv"] {
+            let path = at("a").join(chart).with_extension(ending);
+            assert!(path.exists(), "{}", path.display());
+        }
+    }
+    let unfinished = report::write(&at("cut"), &at("x.html"), None).unwrap_err();
+    assert!(
+        unfinished.to_string().contains("not finished"),
+        "{unfinished}"
+    );
+}
+
+#[test]
+fn a_shard_is_written_as_a_fraction() {
+    assert_eq!("2/5".parse(), Ok(Shard { part: 2, of: 5 }));
+    for wrong in ["0/3", "4/3", "3", "a/b", "1/0"] {
+        assert!(wrong.parse::<Shard>().is_err(), "{wrong}");
+    }
+}
