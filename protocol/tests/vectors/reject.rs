@@ -303,14 +303,23 @@ fn control(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
         ("eleven joints", |a| a.joints = vec![a.joints[0]; 11]),
         ("65 capsules", |a| a.capsules = vec![a.capsules[0]; 65]),
         ("an axis of no length", |a| a.joints[0].axis = [0.0; 3]),
-        ("limits out of order", |a| a.joints[0].limits = Some([1.0, -1.0])),
+        ("limits out of order", |a| {
+            a.joints[0].limits = Some([1.0, -1.0])
+        }),
         ("a tip that is nowhere", |a| a.tip.m[1] = f32::NAN),
         ("a quaternion of length two", |a| a.tip.q[0] = 2.0),
         ("a capsule of nothing", |a| a.capsules[0].radius_m = 0.0),
-        ("a capsule of a joint that is not there", |a| a.capsules[0].link = 2),
+        ("a capsule of a joint that is not there", |a| {
+            a.capsules[0].link = 2
+        }),
     ];
     for (name, change) in wrong {
-        say(ROBOT_CONTROL, &format!("arm, {name}"), arm(change), "Invalid");
+        say(
+            ROBOT_CONTROL,
+            &format!("arm, {name}"),
+            arm(change),
+            "Invalid",
+        );
     }
     say(
         ROBOT_CONTROL,
