@@ -114,6 +114,7 @@ pub struct Relay {
     near: Arc<std::net::UdpSocket>,
     config: RelayConfig,
     clock: HostClock,
+    shapes: watch::Receiver<Option<LinkConfig>>,
 }
 
 struct Client {
@@ -141,7 +142,15 @@ impl Relay {
             near,
             config,
             clock,
+            shapes: watch::channel(None).1,
         })
+    }
+
+    /// Takes on, in both directions, whatever is sent there; packets on their way arrive as they would have.
+    #[must_use]
+    pub fn shaped_by(mut self, shapes: watch::Receiver<Option<LinkConfig>>) -> Self {
+        self.shapes = shapes;
+        self
     }
 
     /// Where it listens.
@@ -153,7 +162,7 @@ impl Relay {
     }
 
     /// Passes packets on until `quit` turns true. `passages` hears of every packet once its fate is done.
-    pub async fn run(self, mut quit: watch::Receiver<bool>, mut passages: impl FnMut(Passage)) {
+    pub async fn run(mut self, mut quit: watch::Receiver<bool>, mut passages: impl FnMut(Passage)) {
         let began = self.clock.now().0;
         let mut up = Link::new(self.config.up.clone(), self.config.seed).beginning_at(began);
         let seed_down = self.config.seed ^ 0x9e37_79b9_7f4a_7c15;
@@ -167,6 +176,14 @@ impl Relay {
             let (is_up, client, at, bytes) = tokio::select! {
                 biased;
                 () = told(&mut quit) => break,
+                Ok(()) = self.shapes.changed() => {
+                    let shape = self.shapes.borrow_and_update().clone();
+                    if let Some(shape) = shape {
+                        up = Link::new(shape.clone(), self.config.seed).beginning_at(began);
+                        down = Link::new(shape, seed_down).beginning_at(began);
+                    }
+                    continue;
+                }
                 Some(passage) = done_rx.recv() => {
                     passages(passage);
                     continue;

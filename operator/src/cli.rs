@@ -11,6 +11,7 @@ mod skills;
 use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
@@ -21,6 +22,7 @@ use telemime_endpoint::peers::{Peers, Role, Source, Whom};
 use telemime_endpoint::{External, HostClock, Identity, Meter, Mono, Trust, quic};
 use tokio::sync::mpsc;
 
+use crate::console::{self, Known, Live};
 use crate::daemon::{Daemon, Learning, Reopen};
 use crate::demonstration::{Demonstration, Sample};
 use crate::placed::Motion;
@@ -28,7 +30,7 @@ use crate::session::Leeway;
 use crate::task::{Outcome, Recording, Task};
 pub use args::{Args, Axes};
 pub use infer::{Bounds, infer};
-use known::Known;
+use known::Known as KnownRobot;
 pub use pair::{PairArgs, pair};
 use played::Played;
 pub use report::{Event, PlayReport, Scores, TurnScores};
@@ -52,7 +54,7 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         bail!("which robot? Give --connect HOST:PORT (or connect = \"…\" in the configuration)");
     };
     let peer_file = args.peer_file.clone().unwrap_or_else(admin::peer_file);
-    let known = Known::find(&Peers::load(&peer_file)?, connect, args.peer.as_deref())?;
+    let known = KnownRobot::find(&Peers::load(&peer_file)?, connect, args.peer.as_deref())?;
     let robot: SocketAddr = cli::resolve(&known.address).map_err(anyhow::Error::msg)?;
     let key = args
         .identity
@@ -201,8 +203,36 @@ fn make_task(
         ([_, ..], _) if args.correct.is_some() => {
             bail!("--correct bends a skill that is played; a replay is the hand itself")
         }
-        _ => bail!("what to do? Give --replay FILE or --play SKILL"),
+        _ => match args.console {
+            Some(addr) => Ok((Task::live(person(args, addr, skills, log)?), None)),
+            None => bail!("what to do? Give --replay FILE, --play SKILL or --console"),
+        },
     }
+}
+
+/// A person at the page, which is served from now on.
+fn person(
+    args: &Args,
+    addr: SocketAddr,
+    skills: &Skills,
+    log: &report::Log,
+) -> anyhow::Result<Live> {
+    let config = args.session()?;
+    let known = skills.all().iter().map(|skill| Known {
+        skill: Arc::clone(skill),
+        plan: infer(skill, Bounds::of(skill), &[])
+            .ok()
+            .map(|(plan, _)| plan),
+    });
+    let (live, port) = console::seat(
+        config.rotation,
+        config.gain,
+        known.collect(),
+        args.console_link,
+    );
+    let url = console::serve(addr, cli::secret()?, port)?;
+    log.say(&Event::Console { url });
+    Ok(live)
 }
 
 /// The hand that corrects a play of `end_s`.

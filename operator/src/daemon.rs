@@ -24,6 +24,7 @@ use telemime_protocol::wire::{DecodeError, Version};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{sleep_until, timeout};
 
+use crate::console::{Act, Said, Shape};
 use crate::dial::{DialError, Dialler, Link, Seen};
 use crate::lessons::{Lesson, LessonError, Lessons};
 use crate::recognise::Recogniser;
@@ -186,6 +187,8 @@ pub enum Notice {
         /// When, on the session clock, the recording's first sample was valid.
         zero: Stamp,
     },
+    /// The link is to be like that: for whoever shapes it.
+    LinkAsked(Shape),
     /// A performance was kept, by this name.
     Kept(String),
     /// The skill was refined.
@@ -220,11 +223,23 @@ struct Console<'a> {
 
 impl Console<'_> {
     /// Does `work` while nobody can be told: a stop is kept in `stop`, a reset is not.
-    async fn beside<T>(&mut self, stop: &mut bool, work: impl Future<Output = T>) -> T {
+    async fn beside<T>(
+        &mut self,
+        now: impl Fn() -> Stamp,
+        task: &mut Task,
+        stop: &mut bool,
+        work: impl Future<Output = T>,
+    ) -> T {
         let mut work = pin!(work);
         loop {
             tokio::select! {
                 biased;
+                (page, said) = hear(task) => match task.person().and_then(|live| live.handle(now(), page, said, None)) {
+                    Some(Act::Stop) => *stop = true,
+                    Some(Act::Shape(shape)) => drop(self.notices.send(Notice::LinkAsked(shape))),
+                    // Refused without a session.
+                    Some(Act::Learn { .. } | Act::Use(_)) | None => {}
+                },
                 Some(word) = self.words.recv() => self.note(match word {
                     Word::Stop => {
                         *stop = true;
@@ -243,6 +258,14 @@ impl Console<'_> {
 
     fn note(&self, text: impl Into<Cow<'static, str>>) {
         let _ = self.notices.send(Notice::Note(text.into()));
+    }
+}
+
+/// What a page says next; never ends without one.
+async fn hear(task: &mut Task) -> (u64, Said) {
+    match task.person() {
+        Some(live) => live.hear().await,
+        None => std::future::pending().await,
     }
 }
 
@@ -288,7 +311,7 @@ impl Daemon {
             let link = tokio::select! {
                 biased;
                 () = told(&mut hung_up) => break,
-                link = self.dial(&mut endpoint, seen, task, &mut console, &mut stop) => link?,
+                link = self.dial(&mut endpoint, seen, &mut *task, &mut console, &mut stop) => link?,
             };
             let Some(link) = link else { break };
             let mut last = link.seen();
@@ -299,7 +322,11 @@ impl Daemon {
             });
             let mut session = Session::new(self.config, lessons.skill(), link.epoch)
                 .speaking(link.version)
-                .watched_by(self.recogniser.clone());
+                .watched_by(
+                    task.person()
+                        .and_then(|live| live.recogniser())
+                        .or_else(|| self.recogniser.clone()),
+                );
             marks.requests = 0;
             if stop {
                 session.stop(self.now());
@@ -331,7 +358,7 @@ impl Daemon {
         }
         if lessons.is_busy() {
             let lesson = lessons.finished().await;
-            self.learned(lesson, &lessons, notices);
+            self.learned(lesson, &lessons, task, notices);
         }
         endpoint.wait_idle().await;
         summary.outcome = task.outcome(*quit.borrow());
@@ -360,7 +387,7 @@ impl Daemon {
         &self,
         endpoint: &mut Endpoint,
         seen: Option<Seen>,
-        task: &Task,
+        task: &mut Task,
         console: &mut Console<'_>,
         stop: &mut bool,
     ) -> Result<Option<Link>, DaemonError> {
@@ -368,7 +395,9 @@ impl Daemon {
         let mut dialler = Dialler::new(endpoint, addr, self.config.versions, seen);
         let (mut said, mut bound) = (None, begun);
         loop {
-            let outcome = console.beside(stop, dialler.next()).await;
+            let outcome = console
+                .beside(|| self.now(), task, stop, dialler.next())
+                .await;
             let patient = self.now().secs_since(begun) <= self.patience.as_secs_f64();
             let why = match outcome {
                 Some(Ok(link)) => return Ok(Some(link)),
@@ -461,6 +490,9 @@ impl Daemon {
                 task.on_event(now, &event);
                 let _ = notices.send(Notice::Event(now, event));
             }
+            if let Some(live) = task.person() {
+                live.sent(self.meter.counts().sent.bytes);
+            }
             let advice = task.advise(now, session);
             if advice == Advice::Performed {
                 marks.performances += 1;
@@ -523,9 +555,19 @@ impl Daemon {
                         }
                     }
                 },
+                (page, said) = hear(task) => {
+                    let now = self.now();
+                    let act = task.person().and_then(|live| live.handle(now, page, said, Some(session)));
+                    if let Some(act) = act {
+                        self.act(act, session, task, lessons, notices);
+                    }
+                }
                 lesson = lessons.finished() => {
-                    if let Some(skill) = self.learned(lesson, lessons, notices) {
+                    if let Some(skill) = self.learned(lesson, lessons, task, notices) {
                         session.replace_skill(skill);
+                        if let Some(recogniser) = task.person().and_then(|live| live.recogniser()) {
+                            session.watch_by(Some(recogniser));
+                        }
                     }
                 }
                 frame = link.frames.recv() => match frame {
@@ -561,6 +603,36 @@ impl Daemon {
         }
     }
 
+    /// What the person at the page wants, and only the daemon can do.
+    fn act(
+        &self,
+        act: Act,
+        session: &mut Session,
+        task: &mut Task,
+        lessons: &mut Lessons,
+        notices: &mpsc::UnboundedSender<Notice>,
+    ) {
+        match act {
+            Act::Stop => session.stop(self.now()),
+            Act::Shape(shape) => drop(notices.send(Notice::LinkAsked(shape))),
+            Act::Use(skill) => {
+                lessons.adopt(Arc::clone(&skill));
+                session.replace_skill(skill);
+            }
+            Act::Learn {
+                name,
+                strokes,
+                others,
+            } => {
+                if let Err((strokes, why)) = lessons.teach(name, strokes, others)
+                    && let Some(live) = task.person()
+                {
+                    live.on_no_lesson(strokes, &why);
+                }
+            }
+        }
+    }
+
     /// What the person at the terminal says of learning.
     fn lesson(
         &self,
@@ -588,8 +660,12 @@ impl Daemon {
         &self,
         lesson: Result<Lesson, LessonError>,
         lessons: &Lessons,
+        task: &mut Task,
         notices: &mpsc::UnboundedSender<Notice>,
     ) -> Option<Arc<Skill>> {
+        if let Some(live) = task.person() {
+            live.on_lesson(&lesson);
+        }
         let note = |text: String| drop(notices.send(Notice::Note(text.into())));
         let lesson = match lesson {
             Ok(lesson) => lesson,

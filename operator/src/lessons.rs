@@ -3,11 +3,14 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
 use tokio::task::JoinHandle;
 
+use crate::cli::{Bounds, infer};
 use crate::demonstration::{Demonstration, DemonstrationError, Sample};
-use crate::learn::{LearnError, Refinement, refine};
+use crate::learn::{LearnError, LearnOptions, Refinement, learn_skill, refine};
+use crate::recognise::{RecogniseOptions, Recogniser};
 use crate::session::HandSample;
 use crate::skill_file::{self, SkillFileError};
 
@@ -52,6 +55,17 @@ pub struct Lesson {
     pub learned: Vec<Refinement>,
     /// Those left out, with the reason.
     pub left_out: Vec<(String, String)>,
+    /// Of a skill that was learned anew: what else goes with it.
+    pub taught: Option<Taught>,
+}
+
+/// What goes with a skill that was learned anew.
+#[derive(Debug)]
+pub struct Taught {
+    /// Its motion; `None` if it has none to play.
+    pub plan: Option<PosePlan>,
+    /// What tells it from the others; `None` if nothing does.
+    pub recogniser: Option<Recogniser>,
 }
 
 /// Performances kept in this run, and the skill that learns from them, on a thread of its own.
@@ -122,6 +136,32 @@ impl Lessons {
         Ok(())
     }
 
+    /// Begins to learn a skill of this name from `strokes`; `others` are those it is to be told from.
+    ///
+    /// # Errors
+    /// [`LessonError::Busy`], with the strokes.
+    pub fn teach(
+        &mut self,
+        name: String,
+        strokes: Vec<Demonstration>,
+        others: Vec<Arc<Skill>>,
+    ) -> Result<(), (Vec<Demonstration>, LessonError)> {
+        if self.is_busy() {
+            return Err((strokes, LessonError::Busy));
+        }
+        let work = move || taught(&name, &strokes, &others);
+        self.work = Some(tokio::task::spawn_blocking(work));
+        Ok(())
+    }
+
+    /// Goes on with `skill`; nothing happens while another is being learned.
+    pub fn adopt(&mut self, skill: Arc<Skill>) {
+        if !self.is_busy() {
+            self.skill = Some(skill);
+            self.kept.clear();
+        }
+    }
+
     /// Whether the skill is being refined.
     pub fn is_busy(&self) -> bool {
         self.work.is_some()
@@ -180,5 +220,31 @@ fn learn_from(skill: &Arc<Skill>, kept: &[Demonstration]) -> Lesson {
         skill: newest.map(Arc::new),
         learned,
         left_out,
+        taught: None,
+    }
+}
+
+fn taught(name: &str, strokes: &[Demonstration], others: &[Arc<Skill>]) -> Lesson {
+    match learn_skill(name, strokes, &LearnOptions::default(), |_| {}) {
+        Ok(skill) => {
+            let plan = infer(&skill, Bounds::of(&skill), &[]);
+            let all = others.iter().map(AsRef::as_ref).chain([&skill]);
+            let recogniser = Recogniser::new(all, RecogniseOptions::default());
+            Lesson {
+                taught: Some(Taught {
+                    plan: plan.ok().map(|(plan, _)| plan),
+                    recogniser: recogniser.ok(),
+                }),
+                skill: Some(Arc::new(skill)),
+                learned: Vec::new(),
+                left_out: Vec::new(),
+            }
+        }
+        Err(e) => Lesson {
+            skill: None,
+            learned: Vec::new(),
+            left_out: vec![(name.to_owned(), e.to_string())],
+            taught: None,
+        },
     }
 }

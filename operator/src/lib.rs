@@ -2,6 +2,7 @@
 //! only when the robot's own prediction would go wrong.
 
 pub mod cli;
+pub mod console;
 pub mod daemon;
 pub mod demonstration;
 pub mod dial;

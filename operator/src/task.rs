@@ -6,6 +6,7 @@ use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, Refusal, RobotState};
 
+use crate::console::Live;
 use crate::demonstration::Sample;
 use crate::session::{Event, HandSample, LOST_S, Leeway, Session};
 
@@ -58,6 +59,8 @@ enum Work {
         plan: PosePlan,
         beside: Option<Beside>,
     },
+    /// A person at the console page: no end of its own.
+    Live(Box<Live>),
 }
 
 /// A hand beside a motion that is played.
@@ -140,6 +143,19 @@ impl Task {
         })
     }
 
+    /// Does what the person at the page does, until it is told to quit.
+    pub fn live(live: Live) -> Self {
+        Self::new(Work::Live(Box::new(live)))
+    }
+
+    /// The person at the page, if that is the task.
+    pub fn person(&mut self) -> Option<&mut Live> {
+        match &mut self.work {
+            Work::Live(live) => Some(live),
+            Work::Replay { .. } | Work::Play { .. } => None,
+        }
+    }
+
     fn new(work: Work) -> Self {
         Self {
             work,
@@ -160,6 +176,7 @@ impl Task {
                 self.started.map(|t| t.offset_by_secs(recording.rest_s))
             }
             Work::Play { .. } => self.engaged_at,
+            Work::Live(_) => None,
         }
     }
 
@@ -168,6 +185,7 @@ impl Task {
         match &self.work {
             Work::Replay { recording, next } => *next as f64 / self.count(recording) as f64,
             Work::Play { .. } => f64::from(u8::from(self.phase == Phase::Over)),
+            Work::Live(_) => 0.0,
         }
     }
 
@@ -182,6 +200,7 @@ impl Task {
                             .is_some_and(|zero| now.secs_since(zero) > end_s + LEAVE_S)
                     }
                     Work::Play { .. } => self.trouble.is_some(),
+                    Work::Live(_) => false,
                 }
     }
 
@@ -193,6 +212,7 @@ impl Task {
     /// How it ended; `quit` says that it was cut short from outside.
     pub fn outcome(&self, quit: bool) -> Outcome {
         match &self.trouble {
+            None if quit && matches!(self.work, Work::Live(_)) => Outcome::Completed,
             Some(why) => Outcome::Interrupted(why.clone()),
             None if quit => Outcome::Interrupted("stopped by hand".into()),
             None if self.phase == Phase::Over => Outcome::Completed,
@@ -202,6 +222,9 @@ impl Task {
 
     /// The connection was lost: the arm holds, and nothing here engages it again.
     pub fn on_lost(&mut self, why: &str) {
+        if let Some(live) = self.person() {
+            return live.on_lost(why);
+        }
         match self.phase {
             Phase::Asked | Phase::Engaged => self.give_up(format!(
                 "the link was lost ({why}); the arm holds and is not engaged again by itself"
@@ -214,6 +237,9 @@ impl Task {
 
     /// The session reports.
     pub fn on_event(&mut self, now: Stamp, event: &Event) {
+        if let Some(live) = self.person() {
+            return live.on_event(now, event);
+        }
         match event {
             Event::Engaged { t_us, .. } => {
                 self.phase = Phase::Engaged;
@@ -248,6 +274,10 @@ impl Task {
 
     /// Feeds the session what is due at `now`.
     pub fn advise(&mut self, now: Stamp, session: &mut Session) -> Advice {
+        if let Some(live) = self.person() {
+            live.advise(now, session);
+            return Advice::Continue;
+        }
         match self.phase {
             Phase::Over => return Advice::Finished,
             Phase::Between => return Advice::Between,
@@ -269,6 +299,7 @@ impl Task {
         let may_ask = self.trouble.is_none()
             && matches!(self.phase, Phase::Waiting(at) if at.is_none_or(|at| now >= at));
         match &mut self.work {
+            Work::Live(_) => {}
             Work::Play { plan, beside } if may_ask => {
                 session.play(plan, beside.as_ref().map(|beside| &beside.leeway));
                 self.asked();
@@ -336,6 +367,9 @@ impl Task {
 
     /// When [`Task::advise`] has something to do next.
     pub fn poll_timeout(&self) -> Option<Stamp> {
+        if let Work::Live(live) = &self.work {
+            return live.poll_timeout();
+        }
         if matches!(self.phase, Phase::Between | Phase::Over) {
             return None;
         }

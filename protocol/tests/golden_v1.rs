@@ -1,5 +1,6 @@
 //! The bytes of version 1, for ever: a message that no longer encodes to these needs a new version.
 
+use telemime_protocol::wire::arm::{WireArm, WireCapsule, WireJoint, WireJointKind, WirePlace};
 use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::KnotBlock;
@@ -186,6 +187,55 @@ fn robot_control() {
                 changes: 9,
             },
             "05030209",
+        ),
+        (
+            RobotControl::Arm(WireArm {
+                joints: vec![
+                    WireJoint {
+                        place: WirePlace {
+                            m: [0.0, 0.0, 0.25],
+                            q: [1.0, 0.0, 0.0, 0.0],
+                        },
+                        axis: [0.0, 0.0, 1.0],
+                        kind: WireJointKind::Revolute,
+                        limits: Some([-2.5, 2.5]),
+                    },
+                    WireJoint {
+                        place: WirePlace {
+                            m: [0.0, 0.0, 0.5],
+                            q: [0.5, -0.5, 0.5, -0.5],
+                        },
+                        axis: [0.0, -1.0, 0.0],
+                        kind: WireJointKind::Prismatic,
+                        limits: None,
+                    },
+                ],
+                tip: WirePlace {
+                    m: [0.125, 0.0, 0.0],
+                    q: [1.0, 0.0, 0.0, 0.0],
+                },
+                capsules: vec![WireCapsule {
+                    link: 2,
+                    from: [0.0, 0.0, 0.0],
+                    to: [0.125, 0.0, 0.0],
+                    radius_m: 0.0625,
+                }],
+            }),
+            "060200000000000000000000803e0000803f00000000000000000000000000000000000000000000803f0001000020c000002040 \
+             00000000000000000000003f0000003f000000bf0000003f000000bf00000000000080bf000000000100 \
+             0000003e00000000000000000000803f000000000000000000000000 \
+             01020000000000000000000000000000003e00000000000000000000803d",
+        ),
+        (
+            RobotControl::Arm(WireArm {
+                joints: Vec::new(),
+                tip: WirePlace {
+                    m: [0.0; 3],
+                    q: [1.0, 0.0, 0.0, 0.0],
+                },
+                capsules: Vec::new(),
+            }),
+            "0600 000000000000000000000000 0000803f000000000000000000000000 00",
         ),
     ]);
 }

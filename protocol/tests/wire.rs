@@ -10,6 +10,7 @@ use telemime_protocol::checkpoint::path::{PathGrid, PathKnot};
 use telemime_protocol::predict::{HandState, Params};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::DecodeError;
+use telemime_protocol::wire::arm::{WireArm, WireCapsule, WireJoint, WireJointKind, WirePlace};
 use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
@@ -234,7 +235,42 @@ fn robot_control() -> impl Strategy<Value = RobotControl> {
                 changes,
             }
         }),
+        arm(),
     ]
+}
+
+fn arm() -> impl Strategy<Value = RobotControl> {
+    let length = || -100.0..=100.0f32;
+    let three = move || [length(), length(), length()];
+    let q = || prop_oneof![Just([1.0, 0.0, 0.0, 0.0]), Just([0.5f32, -0.5, 0.5, -0.5])];
+    let place = move || (three(), q()).prop_map(|(m, q)| WirePlace { m, q });
+    let kind = prop_oneof![
+        Just(WireJointKind::Revolute),
+        Just(WireJointKind::Prismatic)
+    ];
+    let joint =
+        (place(), kind, option::of(0.0..=3.0f32)).prop_map(|(place, kind, upper)| WireJoint {
+            place,
+            axis: [0.0, -1.0, 0.0],
+            kind,
+            limits: upper.map(|upper| [-1.0, upper]),
+        });
+    let capsule = (three(), three(), 1e-3..=100.0f32);
+    (vec(joint, 0..=10), place(), vec(capsule, 0..=64)).prop_map(|(joints, tip, capsules)| {
+        let links = joints.len() as u8 + 1;
+        let numbered = (0..).zip(capsules);
+        let capsules = numbered.map(|(i, (from, to, radius_m))| WireCapsule {
+            link: i % links,
+            from,
+            to,
+            radius_m,
+        });
+        RobotControl::Arm(WireArm {
+            joints,
+            tip,
+            capsules: capsules.collect(),
+        })
+    })
 }
 
 const CODE_BOUND_M: f64 = 0.02;

@@ -394,6 +394,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     );
     let daemon = daemon
         .with_external(dispersion.map(External::host))
+        .showing(rig.described())
         .with_black_box(asker);
     let (notices, heard) = mpsc::unbounded_channel();
     let listener = tokio::spawn(listen_to(

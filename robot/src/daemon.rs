@@ -9,6 +9,7 @@ use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::{External, Fingerprint, HostClock, Mono, Standing, Trust, quic, trust};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::wire::Version;
+use telemime_protocol::wire::arm::WireArm;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::pair;
@@ -61,6 +62,8 @@ pub struct Daemon {
     clock: HostClock,
     /// What operators are told of the arm.
     info: Info,
+    /// How it is built, if operators are to know.
+    arm: Option<WireArm>,
     /// Session settings.
     config: SessionConfig,
     /// The servo's rings.
@@ -168,6 +171,7 @@ impl Daemon {
             endpoint,
             clock,
             info,
+            arm: None,
             config,
             servo,
             timing,
@@ -184,6 +188,13 @@ impl Daemon {
     #[must_use]
     pub fn with_external(mut self, external: Option<External>) -> Self {
         self.external = external;
+        self
+    }
+
+    /// The same, telling operators how the arm is built.
+    #[must_use]
+    pub fn showing(mut self, arm: WireArm) -> Self {
+        self.arm = Some(arm);
         self
     }
 
@@ -386,7 +397,8 @@ impl Daemon {
         // The first of an empty queue.
         let _ = writer.raw(ack.encode());
         let session = Session::new(self.config, self.info.clone(), *epoch, skill.clone(), now)
-            .speaking(version);
+            .speaking(version)
+            .showing(self.arm.clone());
         *active = Some(Active {
             session,
             connection,

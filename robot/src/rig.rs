@@ -3,9 +3,14 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use nalgebra::Isometry3;
+use telemime_protocol::wire::arm::{
+    MAX_CAPSULES, WireArm, WireCapsule, WireJoint, WireJointKind, WirePlace,
+};
 use telemime_protocol::wire::v1::{Info, RobotState};
 use telemime_sim::arm::{
-    ArmError, ArmModel, ContactPlane, Gripper, Joints, LoadOptions, Plant, PlantError, default_urdf,
+    ArmError, ArmModel, ContactPlane, Gripper, JointKind, Joints, LoadOptions, Plant, PlantError,
+    default_urdf,
 };
 
 use crate::control::{ControlConfig, ControlError, Controller, home_posture, workspace_radius};
@@ -212,6 +217,38 @@ impl Rig {
         }
     }
 
+    /// How the arm is built, for whoever draws it.
+    pub fn described(&self) -> WireArm {
+        let joint = |joint: &telemime_sim::arm::Joint| WireJoint {
+            place: place(&joint.placement),
+            axis: joint.axis.cast::<f32>().into(),
+            kind: match joint.kind {
+                JointKind::Revolute => WireJointKind::Revolute,
+                JointKind::Prismatic => WireJointKind::Prismatic,
+            },
+            limits: joint
+                .is_limited()
+                .then_some([joint.lower as f32, joint.upper as f32]),
+        };
+        let capsule = |capsule: &telemime_sim::arm::Capsule| WireCapsule {
+            link: capsule.body as u8,
+            from: capsule.a.cast::<f32>().into(),
+            to: capsule.b.cast::<f32>().into(),
+            radius_m: capsule.radius_m as f32,
+        };
+        WireArm {
+            joints: self.arm.joints().iter().map(joint).collect(),
+            tip: place(self.arm.tip_offset()),
+            capsules: self
+                .arm
+                .capsules()
+                .iter()
+                .take(MAX_CAPSULES)
+                .map(capsule)
+                .collect(),
+        }
+    }
+
     /// A controller and a plant at the start posture, for a run without a session.
     pub fn parts(&self) -> (Controller, Plant) {
         (self.controller.clone(), self.plant.clone())
@@ -252,8 +289,20 @@ impl Rig {
     }
 }
 
+fn place(at: &Isometry3<f64>) -> WirePlace {
+    let q = at.rotation.cast::<f32>();
+    WirePlace {
+        m: at.translation.vector.cast::<f32>().into(),
+        q: [q.w, q.i, q.j, q.k],
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use nalgebra::{Quaternion, Translation3, Unit, UnitQuaternion, Vector3};
+    use telemime_protocol::wire::v1::{Message, RobotControl};
+    use telemime_sim::arm::Kinematics;
+
     use super::*;
 
     #[test]
@@ -266,6 +315,41 @@ mod tests {
         assert!(
             matches!(error, RigError::NoRoom { radius_m, .. } if radius_m < LEAST_RADIUS_M),
             "{error}"
+        );
+    }
+
+    /// As the document says it is to be read.
+    fn pose(at: &WirePlace) -> Isometry3<f64> {
+        let [w, x, y, z] = at.q.map(f64::from);
+        let [a, b, c] = at.m.map(f64::from);
+        let q = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+        Isometry3::from_parts(Translation3::new(a, b, c), q)
+    }
+
+    #[test]
+    fn what_is_described_has_its_tip_where_the_arm_has() {
+        let rig = Rig::load(&RigOptions::default()).unwrap();
+        let arm = rig.described();
+        let described = RobotControl::Arm(arm.clone());
+        let heard = RobotControl::decode(&described.encode());
+        assert_eq!(heard.as_ref(), Ok(&described));
+        for turned in [0.0, 0.3, -0.2] {
+            let q = rig.home.map(|q| q + turned);
+            let mut at = Isometry3::identity();
+            for (joint, q) in arm.joints.iter().zip(q.iter()) {
+                let axis = Unit::new_normalize(Vector3::from(joint.axis.map(f64::from)));
+                assert_eq!(joint.kind, WireJointKind::Revolute);
+                at = at * pose(&joint.place) * UnitQuaternion::from_axis_angle(&axis, *q);
+            }
+            at *= pose(&arm.tip);
+            let mut kinematics = Kinematics::new();
+            kinematics.update(&rig.arm, &q);
+            assert!((at.translation.vector - kinematics.tip()).norm() < 1e-5);
+        }
+        assert!(
+            arm.capsules.len() >= 4,
+            "a picture of an arm: {:?}",
+            arm.capsules
         );
     }
 }

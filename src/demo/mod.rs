@@ -4,10 +4,12 @@
 mod correct;
 mod figures;
 mod judge;
+mod page;
 mod play;
 mod processes;
 mod summary;
 
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -34,6 +36,16 @@ pub(crate) struct Args {
     /// Play, and let a generated hand correct the motion: it pushes aside, resists until it has taken over, lets go.
     #[arg(long, requires = "play", conflicts_with = "wrist")]
     correct: bool,
+    /// Serve a page to teach and drive from a browser, across the link, which the page can set [default:
+    /// 127.0.0.1:8723]. Nothing is learned before.
+    #[arg(
+        long,
+        value_name = "ADDR",
+        num_args = 0..=1,
+        default_missing_value = "127.0.0.1:8723",
+        conflicts_with_all = ["play", "demos", "replay", "axes", "scale", "input_latency", "seed", "wrist"]
+    )]
+    console: Option<SocketAddr>,
     /// Learn from this folder of recordings (CSV: t,x,y,z) instead.
     #[arg(long, value_name = "DIR")]
     demos: Option<PathBuf>,
@@ -93,6 +105,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let scratch = tempfile::tempdir().context("no temporary folder")?;
     std::fs::create_dir_all(&args.out)
         .with_context(|| format!("cannot make {}", args.out.display()))?;
+    if let Some(addr) = args.console {
+        return page::run(args, addr, scratch.path());
+    }
     let mut material = material(args, scratch.path())?;
     if args.correct {
         material.correction = Some(correct::hand(args, &material)?);

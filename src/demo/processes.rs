@@ -33,7 +33,7 @@ pub(super) struct Run {
     pub(super) skill: PathBuf,
 }
 
-struct Process {
+pub(super) struct Process {
     name: &'static str,
     child: Child,
     lines: Lines<BufReader<ChildStdout>>,
@@ -41,7 +41,7 @@ struct Process {
 
 impl Process {
     /// Starts this very program as one of the daemons. It ends when we do: its stdin is ours.
-    fn start(name: &'static str, args: &[String]) -> anyhow::Result<Self> {
+    pub(super) fn start(name: &'static str, args: &[String]) -> anyhow::Result<Self> {
         let program = std::env::current_exe().context("where is this program?")?;
         let mut child = Command::new(program)
             .arg(name)
@@ -61,7 +61,7 @@ impl Process {
     }
 
     /// The next event; `None` once the process has closed its stdout.
-    async fn next<E: DeserializeOwned>(&mut self) -> anyhow::Result<Option<E>> {
+    pub(super) async fn next<E: DeserializeOwned>(&mut self) -> anyhow::Result<Option<E>> {
         let Some(line) = self.lines.next_line().await? else {
             return Ok(None);
         };
@@ -71,7 +71,10 @@ impl Process {
     }
 
     /// Closes its stdin, which ends it, and collects what it still says.
-    async fn finish<E: DeserializeOwned>(mut self, events: &mut Vec<E>) -> anyhow::Result<()> {
+    pub(super) async fn finish<E: DeserializeOwned>(
+        mut self,
+        events: &mut Vec<E>,
+    ) -> anyhow::Result<()> {
         drop(self.child.stdin.take());
         let rest = async {
             while let Some(event) = self.next().await? {
@@ -101,13 +104,24 @@ fn flag<T: ToString>(name: &str, value: Option<T>) -> Vec<String> {
     value.map_or_else(Vec::new, |v| vec![name.to_owned(), v.to_string()])
 }
 
-pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> anyhow::Result<Run> {
+/// A robot that listens, and what an operator needs to call it.
+pub(super) struct Called {
+    pub(super) robot: Process,
+    pub(super) events: Vec<Robot>,
+    pub(super) addr: SocketAddr,
+    /// The operator's flags that say who it is and whom it calls, but not where.
+    pub(super) operator_args: Vec<String>,
+}
+
+/// Starts the robot that `args` ask for; it writes every tick to `ticks`, if there is such a file.
+pub(super) async fn start_robot(
+    args: &Args,
+    scratch: &Path,
+    ticks: Option<&Path>,
+) -> anyhow::Result<Called> {
     let (robot_key, operator_key) = (scratch.join("robot.key"), scratch.join("operator.key"));
     let robot_is = Identity::load_or_create(&robot_key)?.fingerprint();
     let operator_is = Identity::load_or_create(&operator_key)?.fingerprint();
-    let ticks = args.out.join("robot.csv");
-    let skills = args.out.join("skills");
-
     let mut robot_args = vec!["--listen".to_owned(), "127.0.0.1:0".to_owned()];
     robot_args.extend([
         "--identity".to_owned(),
@@ -115,7 +129,7 @@ pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> any
         "--peer".to_owned(),
         operator_is.to_string(),
     ]);
-    robot_args.extend(["--record".to_owned(), text(&ticks)]);
+    robot_args.extend(flag("--record", ticks.map(text)));
     robot_args.extend(flag("--urdf", args.urdf.as_deref().map(text)));
     robot_args.extend(flag("--tip", args.tip.as_ref()));
     robot_args.extend(flag(
@@ -123,8 +137,30 @@ pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> any
         (args.dead_time > 0.0).then(|| format!("{}us", args.dead_time * 1e6)),
     ));
     let mut robot = Process::start("robot", &robot_args)?;
-    let mut robot_events: Vec<Robot> = Vec::new();
-    let addr = listening(&mut robot, &mut robot_events).await?;
+    let mut events: Vec<Robot> = Vec::new();
+    let addr = listening(&mut robot, &mut events).await?;
+    Ok(Called {
+        robot,
+        events,
+        addr,
+        operator_args: vec![
+            "--identity".to_owned(),
+            text(&operator_key),
+            "--peer".to_owned(),
+            robot_is.to_string(),
+        ],
+    })
+}
+
+pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> anyhow::Result<Run> {
+    let ticks = args.out.join("robot.csv");
+    let skills = args.out.join("skills");
+    let Called {
+        mut robot,
+        events: mut robot_events,
+        addr,
+        operator_args: who,
+    } = start_robot(args, scratch, Some(&ticks)).await?;
 
     let clock = HostClock::new();
     let config = RelayConfig {
@@ -144,12 +180,7 @@ pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> any
     });
 
     let mut operator_args = vec!["--connect".to_owned(), via.to_string()];
-    operator_args.extend([
-        "--identity".to_owned(),
-        text(&operator_key),
-        "--peer".to_owned(),
-        robot_is.to_string(),
-    ]);
+    operator_args.extend(who);
     operator_args.extend([
         "--learn".to_owned(),
         text(&material.demos),
@@ -228,7 +259,10 @@ async fn listening(robot: &mut Process, events: &mut Vec<Robot>) -> anyhow::Resu
 }
 
 /// Ends only if the robot does, which it should not.
-async fn watch_robot(robot: &mut Process, events: &mut Vec<Robot>) -> anyhow::Result<()> {
+pub(super) async fn watch_robot(
+    robot: &mut Process,
+    events: &mut Vec<Robot>,
+) -> anyhow::Result<()> {
     while let Some(event) = robot.next().await? {
         events.push(event);
     }

@@ -193,7 +193,8 @@ impl Robot {
         };
         let desk = Desk::new(own, trust.clone(), None);
         let daemon = RobotDaemon::new(endpoint, clock, rig.info(), config, handle, None, desk)
-            .with_external(external);
+            .with_external(external)
+            .showing(rig.described());
         let (quit, quit_rx) = watch::channel(false);
         let (tx, mut rx) = mpsc::unbounded_channel();
         let (words, words_rx) = mpsc::unbounded_channel();

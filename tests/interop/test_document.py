@@ -44,7 +44,7 @@ class Document(unittest.TestCase):
     def test_messages(self):
         kinds = {
             "operator control": "engage-mirror engage-play path reset",
-            "robot control": "info engaged refused state",
+            "robot control": "info engaged refused state arm",
             "operator datagram": "motion motion-pose go go-bend pong stop clock",
             "robot datagram": "ping telemetry reception",
         }

@@ -15,6 +15,7 @@ use telemime_protocol::predict::{
 };
 use telemime_protocol::skill::{Gmm, Pace, Parts, Provenance, Samples, Skill, Source, Stats};
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::arm::{WireArm, WireCapsule, WireJoint, WireJointKind, WirePlace};
 use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::{self, Frame};
@@ -377,6 +378,41 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
                 cause: Cause::LeaseExpired,
                 changes: 9,
             }),
+        ),
+        (
+            "arm",
+            message(&RobotControl::Arm(WireArm {
+                joints: vec![
+                    WireJoint {
+                        place: WirePlace {
+                            m: [0.0, 0.0, 0.25],
+                            q: [1.0, 0.0, 0.0, 0.0],
+                        },
+                        axis: [0.0, 0.0, 1.0],
+                        kind: WireJointKind::Revolute,
+                        limits: Some([-2.5, 2.5]),
+                    },
+                    WireJoint {
+                        place: WirePlace {
+                            m: [0.0, 0.0, 0.5],
+                            q: [0.5, -0.5, 0.5, -0.5],
+                        },
+                        axis: [0.0, -1.0, 0.0],
+                        kind: WireJointKind::Prismatic,
+                        limits: None,
+                    },
+                ],
+                tip: WirePlace {
+                    m: [0.125, 0.0, 0.0],
+                    q: [1.0, 0.0, 0.0, 0.0],
+                },
+                capsules: vec![WireCapsule {
+                    link: 2,
+                    from: [0.0, 0.0, 0.0],
+                    to: [0.125, 0.0, 0.0],
+                    radius_m: 0.0625,
+                }],
+            })),
         ),
         (
             "motion",

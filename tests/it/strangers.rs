@@ -191,7 +191,7 @@ fn garbage_from_a_paired_peer_is_counted_and_does_no_harm() {
             let frame = frames.recv().await.unwrap().unwrap();
             match RobotControl::decode(&frame.payload).unwrap() {
                 RobotControl::ModelStored { id: stored } => break assert_eq!(stored, id),
-                RobotControl::Info(_) | RobotControl::State { .. } => {}
+                RobotControl::Info(_) | RobotControl::Arm(_) | RobotControl::State { .. } => {}
                 other => panic!("{other:?}"),
             }
         }

@@ -1,6 +1,7 @@
 //! Flags over a TOML file over defaults, checked.
 
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -9,6 +10,7 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 use serde::Deserialize;
 use telemime_endpoint::cli;
 
+use crate::console::Shape;
 use crate::placed::Placed;
 use crate::session::{FutureBound, SessionConfig};
 
@@ -73,6 +75,19 @@ pub struct Args {
     /// has let go, and the skill goes on.
     #[arg(long, value_name = "FILE", conflicts_with = "replay")]
     pub correct: Option<PathBuf>,
+    /// Serve a page to watch and drive from a browser, here [default: 127.0.0.1:8723]; beyond this host it takes the
+    /// token in the address that is printed. Strokes drawn there are demonstrations.
+    #[arg(
+        long,
+        value_name = "ADDR",
+        num_args = 0..=1,
+        default_missing_value = CONSOLE,
+        conflicts_with_all = ["replay", "play"]
+    )]
+    pub console: Option<SocketAddr>,
+    /// The page may set the link, which is like this now: delay and jitter in ms, loss in percent.
+    #[arg(long, hide = true, requires = "console", value_name = "MS,MS,PERCENT", value_parser = parse_shape)]
+    pub console_link: Option<Shape>,
     /// How exactly the hand means its corrections, m: against the skill's own deviation this decides how much they
     /// bend it [default: 0.02].
     #[arg(long, value_name = "M")]
@@ -133,6 +148,24 @@ pub struct Args {
     /// Stop when stdin ends: for a parent process that must not leave orphans.
     #[arg(long, hide = true)]
     pub follow_stdin: bool,
+}
+
+/// Where the page is served unless said otherwise.
+const CONSOLE: &str = "127.0.0.1:8723";
+
+/// ε_path of what is driven in the page, m.
+const CONSOLE_PATH_BOUND_M: f64 = 0.005;
+
+fn parse_shape(text: &str) -> Result<Shape, String> {
+    let numbers: Vec<f64> = text.split(',').filter_map(|n| n.parse().ok()).collect();
+    let [delay_ms, jitter_ms, loss_percent] = numbers[..] else {
+        return Err(format!("`{text}`: write three numbers"));
+    };
+    Ok(Shape {
+        delay_ms,
+        jitter_ms,
+        loss_percent,
+    })
 }
 
 /// How the tracker's axes lie to the robot's (x forward, y left, z up).
@@ -247,6 +280,7 @@ struct File {
     replay: Option<Files>,
     refine: Option<bool>,
     play: Option<String>,
+    console: Option<SocketAddr>,
     #[serde(default)]
     frames: BTreeMap<String, Vec<f64>>,
     correct: Option<PathBuf>,
@@ -299,9 +333,10 @@ impl Args {
             (self.learn, self.skill) = (file.learn, file.skills);
         }
         self.matching = self.matching.or(file.matching);
-        if self.replay.is_empty() && self.play.is_none() {
+        if self.replay.is_empty() && self.play.is_none() && self.console.is_none() {
             self.replay = file.replay.map_or_else(Vec::new, Vec::from);
             self.play = file.play;
+            self.console = file.console;
             // As on the command line: there is nothing to refine by what is only played.
             self.refine |= file.refine.unwrap_or(false) && self.play.is_none();
         }
@@ -345,20 +380,28 @@ impl Args {
         Ok(self)
     }
 
+    /// Whether all there is to predict with is what will be taught in the page: its hand moves in base axes, metre for
+    /// metre.
+    fn is_taught_in_the_page(&self) -> bool {
+        self.console.is_some() && self.learn.is_empty() && self.skill.is_empty()
+    }
+
     pub(super) fn session(&self) -> anyhow::Result<SessionConfig> {
+        let page = self.is_taught_in_the_page();
+        let axes = if page { Axes::Base } else { Axes::Kinect };
         let defaults = SessionConfig::default();
         let config = SessionConfig {
             max_silence_s: self.max_silence.unwrap_or(defaults.max_silence_s),
             min_interval_s: self.min_interval.unwrap_or(defaults.min_interval_s),
             lease_s: self.lease.unwrap_or(defaults.lease_s),
             future_bound: self.future_bound.unwrap_or(defaults.future_bound),
-            path_bound_m: self.path_bound,
+            path_bound_m: self.path_bound.or(page.then_some(CONSOLE_PATH_BOUND_M)),
             input_latency_s: self.input_latency.unwrap_or(0.0),
             glitch_gate: self.glitch_gate,
             gain: self.gain.unwrap_or(defaults.gain),
             hand_sigma_m: self.hand_sigma.unwrap_or(defaults.hand_sigma_m),
-            scale: self.scale,
-            rotation: self.axes.unwrap_or_default().rotation(),
+            scale: self.scale.or(page.then_some(1.0)),
+            rotation: self.axes.unwrap_or(axes).rotation(),
             versions: telemime_endpoint::cli::versions(self.protocol_max)?,
         };
         let within = |name: &str, value: f64, low: f64, high: f64| -> anyhow::Result<()> {
@@ -456,6 +499,7 @@ mod tests {
             .and_then(|rest| rest.split("```").next())
             .unwrap()
             .replace("# play", "play")
+            .replace("# console", "console")
             .replace("# correct", "correct")
             .replace("# hand_sigma_m", "hand_sigma_m")
             .replace("# bound_m", "bound_m")

@@ -11,6 +11,7 @@ use telemime_endpoint::meter::Counts;
 use tokio::sync::mpsc;
 
 use super::played::Played;
+use crate::console::Shape;
 use crate::daemon::{Notice, Summary};
 use crate::learn::align::Aligned;
 use crate::recognise::Verdict;
@@ -225,6 +226,10 @@ pub enum Event {
         number: u32,
         zero_mono_ns: i64,
     },
+    Console {
+        url: String,
+    },
+    LinkAsked(Shape),
     Kept {
         name: String,
     },
@@ -398,7 +403,18 @@ impl Event {
             }
             // With one performance, the line at the end says all.
             Self::Performed { .. } => return None,
+            Self::Console { url } => format!("the page is at {url}"),
+            Self::LinkAsked(_) => return None,
             Self::Kept { name } => format!("kept as {name}"),
+            Self::Refined {
+                skill,
+                id,
+                demonstrations,
+                learned,
+                ..
+            } if learned.is_empty() => {
+                format!("learned {skill} from {demonstrations} strokes, id {id}")
+            }
             Self::Refined {
                 skill,
                 id,
@@ -511,6 +527,7 @@ pub(super) async fn listen_to(
                 number,
                 zero_mono_ns: zero.0 + epoch.0,
             },
+            Notice::LinkAsked(shape) => Event::LinkAsked(shape),
             Notice::Kept(name) => Event::Kept { name },
             Notice::Refined { skill, learned } => Event::Refined {
                 skill: skill.name().to_owned(),

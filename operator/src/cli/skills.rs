@@ -101,6 +101,11 @@ impl Skills {
         Ok(())
     }
 
+    /// All of them.
+    pub fn all(&self) -> &[Arc<Skill>] {
+        &self.all
+    }
+
     /// The model to mirror with, if there is any.
     pub fn mirror(&self) -> Option<Arc<Skill>> {
         self.mirror.clone()

@@ -231,6 +231,11 @@ impl Adaptation<TurnState> {
 }
 
 impl<C: Course> Adaptation<C> {
+    /// Predicts with this gain κ in [0, 1] from now on.
+    pub fn set_gain(&mut self, gain: f64) {
+        self.gain = gain.clamp(0.0, 1.0);
+    }
+
     fn new(gain: f64, start: Option<&Calibration>, rest: f64) -> Self {
         let at = |c: &Calibration| BAND_KNOTS.map(|knot| c.errors[knot - 1].map(|v| 3.0 * v));
         Self {

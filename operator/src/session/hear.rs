@@ -24,6 +24,7 @@ impl Session {
         };
         match message {
             RobotControl::Info(info) => self.on_info(info),
+            RobotControl::Arm(arm) => self.arm = Some(arm),
             RobotControl::ModelStored { id } => {
                 if self.skill.as_ref().is_some_and(|skill| skill.id().0 == id) && !self.model_stored
                 {

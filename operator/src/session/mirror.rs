@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use nalgebra::Vector3;
 use telemime_protocol::checkpoint::CheckpointError;
 use telemime_protocol::checkpoint::path::{CONTEXT, PathEncoder, PathKnot};
-use telemime_protocol::predict::{HandState, Params, TurnState, checksum};
+use telemime_protocol::predict::{Forecast, HandState, Params, TurnState, checksum};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
@@ -44,6 +44,9 @@ const PATIENCE_S: f64 = 0.15;
 /// What is kept of an engagement, in samples: half an hour of a tracker of 60 Hz. What comes later is not.
 const MOST_DRIVEN: usize = 108_000;
 
+/// Knots that are shown.
+const SHOWN_KNOTS: usize = 48;
+
 /// A sample that its prediction stands for, for the time being.
 struct Suspect {
     seen: HandSample,
@@ -70,6 +73,8 @@ pub(super) struct Mirror {
     held: VecDeque<PathKnot>,
     unacknowledged: VecDeque<Unacknowledged>,
     first_unacknowledged: u32,
+    /// The newest knots, for display.
+    shown: VecDeque<Vector3<f64>>,
     places: Adaptation<HandState>,
     turns: Adaptation<TurnState>,
     without_model: bool,
@@ -117,6 +122,7 @@ impl Mirror {
             held: VecDeque::with_capacity(CONTEXT + 1),
             unacknowledged: VecDeque::new(),
             first_unacknowledged: 0,
+            shown: VecDeque::with_capacity(SHOWN_KNOTS),
             places,
             turns,
             // The robot ends with the model it began with, so a model that arrives now is for the next engagement.
@@ -157,6 +163,24 @@ impl Mirror {
             }
         }
         self.first_unacknowledged += known as u32;
+    }
+
+    /// What the robot predicts from.
+    pub(super) fn told(&self) -> Option<Forecast> {
+        self.sent.map(|sent| sent.place)
+    }
+
+    /// The newest knots, and whether the robot holds them.
+    pub(super) fn recent_knots(&self) -> impl Iterator<Item = (Vector3<f64>, bool)> {
+        let held = self.shown.len().saturating_sub(self.unacknowledged.len());
+        let numbered = self.shown.iter().enumerate();
+        numbered.map(move |(i, x)| (*x, i < held))
+    }
+
+    /// From now on.
+    pub(super) fn set_gain(&mut self, gain: f64) {
+        self.places.set_gain(gain);
+        self.turns.set_gain(gain);
     }
 
     /// By what the hand is predicted now, place and orientation.
@@ -236,6 +260,12 @@ impl Mirror {
     }
 
     fn hold(&mut self, knot: PathKnot) {
+        if self.shown.len() == SHOWN_KNOTS {
+            self.shown.pop_front();
+        }
+        let step_m = self.code.grid.step_m();
+        self.shown
+            .push_back(Vector3::from(knot.x.map(|x| f64::from(x) * step_m)));
         self.unacknowledged.push_back(Unacknowledged {
             knot,
             copies: 0,

@@ -15,6 +15,7 @@ mod pace;
 mod said;
 #[cfg(test)]
 mod tests;
+mod view;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -25,6 +26,7 @@ use telemime_protocol::predict::Params;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::Version;
+use telemime_protocol::wire::arm::WireArm;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::v1::{
     Drive, Engage, ExternalClock, Info, Message, OperatorControl, OperatorDatagram, PathTail,
@@ -68,6 +70,7 @@ pub struct Session {
     epoch: u32,
     skill: Option<Arc<Skill>>,
     info: Option<Info>,
+    arm: Option<WireArm>,
     model_stored: bool,
     /// Takes the skill's place as soon as nothing is driven.
     next_skill: Option<Arc<Skill>>,
@@ -116,6 +119,7 @@ impl Session {
             epoch,
             skill,
             info: None,
+            arm: None,
             model_stored: false,
             next_skill: None,
             driven: Vec::new(),

@@ -7,6 +7,7 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 use std::time::Duration;
 
+use ring::rand::{SecureRandom, SystemRandom};
 use serde::Serialize;
 use telemime_protocol::wire::{Version, Versions};
 use tokio::signal::unix::{SignalKind, signal};
@@ -60,6 +61,18 @@ pub fn versions(highest: Option<u16>) -> Result<Versions, UnknownVersion> {
     Version::from_number(number)
         .and_then(|highest| Versions::new(Version::V1, highest))
         .ok_or(UnknownVersion { number })
+}
+
+/// Sixteen bytes that nobody can guess.
+///
+/// # Errors
+/// The system's, if it has no randomness.
+pub fn secret() -> io::Result<[u8; 16]> {
+    let mut bytes = [0; 16];
+    SystemRandom::new()
+        .fill(&mut bytes)
+        .map_err(|_| io::Error::other("the system has no randomness"))?;
+    Ok(bytes)
 }
 
 /// An error and its causes in one line, each said once: a cause that the text before it quotes is left out.

@@ -1,6 +1,7 @@
 //! The wire: one codec, a frozen greeting, framing, and one set of messages per version.
 //! `docs/protocol.md` is the normative text.
 
+pub mod arm;
 pub mod bend;
 pub mod codec;
 pub mod frame;

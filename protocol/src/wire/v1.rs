@@ -5,6 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::arm::WireArm;
 use super::bend::WireBend;
 use super::codec::{self, DecodeError};
 use super::frame::MAX_FRAME_LEN;
@@ -174,6 +175,8 @@ pub enum RobotControl {
         /// Counts the changes since the robot daemon began.
         changes: u32,
     },
+    /// How the arm is built, once a session, after [`RobotControl::Info`]; for display, and not every robot says it.
+    Arm(WireArm),
 }
 
 /// What the operator needs to know of the arm.
@@ -574,6 +577,7 @@ impl RobotControl {
                 hand_q.map_or(Ok(()), |q| q.check("engaged.hand_q"))?;
                 tip_q.check("engaged.tip_q")
             }
+            Self::Arm(arm) => arm.check(),
             Self::ModelStored { .. }
             | Self::PlanStored { .. }
             | Self::Refused { .. }

@@ -3,6 +3,7 @@
 use serde::Serialize;
 use serde_json::json;
 use telemime_protocol::checkpoint::path::{PathGrid, PathKnot, tick_of};
+use telemime_protocol::wire::arm::{WireArm, WireCapsule, WireJoint, WireJointKind, WirePlace};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
@@ -442,5 +443,35 @@ pub(crate) fn messages() -> Vec<Vector> {
         let m = RobotDatagram::Reception(reception(draw));
         all.push(message(ROBOT_DATAGRAM, format!("reception {i}"), &m));
     }
+    for joints in [0, 1, 7, 10] {
+        let m = RobotControl::Arm(arm(draw, joints));
+        all.push(message(ROBOT_CONTROL, format!("arm of {joints}"), &m));
+    }
     all
+}
+
+fn arm(draw: &mut Draw, joints: u8) -> WireArm {
+    let place = |draw: &mut Draw| WirePlace {
+        m: std::array::from_fn(|_| draw.fraction()),
+        q: [[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.5, -0.5]][draw.below(2)],
+    };
+    WireArm {
+        joints: (0..joints)
+            .map(|_| WireJoint {
+                place: place(draw),
+                axis: [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]][draw.below(2)],
+                kind: [WireJointKind::Revolute, WireJointKind::Prismatic][draw.below(2)],
+                limits: draw.maybe(|_| [-1.5, 2.75]),
+            })
+            .collect(),
+        tip: place(draw),
+        capsules: (0..=joints)
+            .map(|link| WireCapsule {
+                link,
+                from: std::array::from_fn(|_| draw.fraction()),
+                to: std::array::from_fn(|_| draw.fraction()),
+                radius_m: 0.0625,
+            })
+            .collect(),
+    }
 }

@@ -2,6 +2,7 @@
 
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::{Skill, SkillError, example};
+use telemime_protocol::wire::arm::{WireArm, WireCapsule, WireJoint, WireJointKind, WirePlace};
 use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::frame::{Deframer, MAX_FRAME_LEN};
 use telemime_protocol::wire::hello::{Answer, Hello, HelloError};
@@ -275,6 +276,52 @@ fn control(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
         change(&mut info);
         RobotControl::Info(info).encode()
     };
+    let arm = |change: fn(&mut WireArm)| {
+        let place = WirePlace {
+            m: [0.0, 0.0, 0.25],
+            q: [1.0, 0.0, 0.0, 0.0],
+        };
+        let mut arm = WireArm {
+            joints: vec![WireJoint {
+                place,
+                axis: [0.0, 0.0, 1.0],
+                kind: WireJointKind::Revolute,
+                limits: Some([-2.5, 2.5]),
+            }],
+            tip: place,
+            capsules: vec![WireCapsule {
+                link: 1,
+                from: [0.0; 3],
+                to: [0.125, 0.0, 0.0],
+                radius_m: 0.0625,
+            }],
+        };
+        change(&mut arm);
+        RobotControl::Arm(arm).encode()
+    };
+    type Wrong = (&'static str, fn(&mut WireArm));
+    let wrong: [Wrong; 8] = [
+        ("eleven joints", |a| a.joints = vec![a.joints[0]; 11]),
+        ("65 capsules", |a| a.capsules = vec![a.capsules[0]; 65]),
+        ("an axis of no length", |a| a.joints[0].axis = [0.0; 3]),
+        ("limits out of order", |a| {
+            a.joints[0].limits = Some([1.0, -1.0])
+        }),
+        ("a tip that is nowhere", |a| a.tip.m[1] = f32::NAN),
+        ("a quaternion of length two", |a| a.tip.q[0] = 2.0),
+        ("a capsule of nothing", |a| a.capsules[0].radius_m = 0.0),
+        ("a capsule of a joint that is not there", |a| {
+            a.capsules[0].link = 2
+        }),
+    ];
+    for (name, change) in wrong {
+        say(
+            ROBOT_CONTROL,
+            &format!("arm, {name}"),
+            arm(change),
+            "Invalid",
+        );
+    }
     say(
         ROBOT_CONTROL,
         "info, a long name",

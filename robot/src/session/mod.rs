@@ -16,6 +16,7 @@ use telemime_endpoint::{Mono, Pacer};
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
+use telemime_protocol::wire::arm::WireArm;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::turn::{WireRotation, dequantise_grip, quantise_grip};
@@ -192,6 +193,15 @@ impl Session {
     #[must_use]
     pub fn speaking(mut self, version: Version) -> Self {
         self.version = version;
+        self
+    }
+
+    /// Says how the arm is built, after what it said of itself.
+    #[must_use]
+    pub fn showing(mut self, arm: Option<WireArm>) -> Self {
+        if let Some(arm) = arm {
+            self.send(&RobotControl::Arm(arm));
+        }
         self
     }
 

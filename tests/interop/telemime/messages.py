@@ -57,6 +57,29 @@ def _engaged(m):
     _rotation_range("tip_q")(m)
 
 
+def _unit(what, numbers):
+    require(abs(sum(n * n for n in numbers) - 1) < 1e-3, what, numbers)
+
+
+def _place(m):
+    require(all(abs(n) <= 100 for n in m["m"]), "m", m["m"])
+    _unit("q", m["q"])
+
+
+def _joint(m):
+    _unit("axis", m["axis"])
+    if m["limits"] is not None:
+        finite("limits", m["limits"])
+        require(m["limits"][0] <= m["limits"][1], "limits", m["limits"])
+
+
+def _arm(m):
+    for capsule in m["capsules"]:
+        require(all(abs(n) <= 100 for n in capsule["from"] + capsule["to"]), "capsule", capsule)
+        require(0 < capsule["radius_m"] <= 100, "radius_m", capsule["radius_m"])
+        require(capsule["link"] <= len(m["joints"]), "link", capsule["link"])
+
+
 def _telemetry(m):
     finite("Telemetry", m["tip_m"], m["q"])
     _rotation_range("tip_q")(m)
@@ -80,6 +103,11 @@ DRIVE = Enum(
     ("Mirror", Struct(("state", STATE), ("model", U16), ("params", PARAMS), ("pose", POSE))),
     ("Play", Struct(("plan", U32))),
 )
+PLACE = Struct(("m", Array(F32, 3)), ("q", Array(F32, 4)), check=_place)
+JOINT = Struct(
+    ("place", PLACE), ("axis", Array(F32, 3)), ("kind", Enum("Revolute", "Prismatic")), ("limits", Option(Array(F32, 2))),
+    check=_joint)  # fmt: skip
+CAPSULE = Struct(("link", U8), ("from", Array(F32, 3)), ("to", Array(F32, 3)), ("radius_m", F32))
 OPERATOR_CONTROL = Enum(
     ("Model", Struct(("id", ID), ("bytes", Bytes(524_288)))),
     ("Plan", Struct(("id", U32), ("bytes", Bytes(131_072)))),
@@ -103,6 +131,7 @@ ROBOT_CONTROL = Enum(
         ("hand_q", Option(ROTATION)), ("tip_q", ROTATION), check=_engaged)),
     ("Refused", Struct(("reason", REASONS))),
     ("State", Struct(("state", STATES), ("cause", CAUSES), ("changes", U32))),
+    ("Arm", Struct(("joints", Vec(JOINT, 10)), ("tip", PLACE), ("capsules", Vec(CAPSULE, 64)), check=_arm)),
 )  # fmt: skip
 OPERATOR_DATAGRAM = Enum(
     ("Motion", Struct(

@@ -1,0 +1,97 @@
+// Everything together, once a frame.
+
+import { Smooth, frames } from "./arm.js";
+import { Drive, History, behind } from "./drive.js";
+import { Fitts } from "./fitts.js";
+import { Link } from "./link.js";
+import { Panel } from "./panel.js";
+import { Plots } from "./plots.js";
+import { Scene } from "./scene.js";
+import { View } from "./view.js";
+
+const $ = (id) => document.getElementById(id);
+const canvas = $("scene");
+const link = new Link();
+const view = new View();
+const smooth = new Smooth();
+const hand = new History();
+const tip = new History();
+let shown = null;
+
+const tipShown = () => (shown && link.arm ? frames(link.arm, shown.q).tip.p : shown?.tip ?? null);
+const drive = new Drive(link, view, canvas, tipShown);
+const fitts = new Fitts(link, view);
+const panel = new Panel(link, drive, fitts);
+const plots = new Plots($("plots"));
+let scene = null;
+try {
+  scene = new Scene(canvas, view);
+} catch (error) {
+  $("plain").hidden = false;
+  panel.log(`no picture: ${error.message}`);
+}
+
+let [measured, before, last] = [{}, null, null];
+
+link.addEventListener("now", ({ detail: now }) => {
+  if (now.arm) {
+    const fresh = now.arm.t !== last;
+    last = now.arm.t;
+    smooth.take(now.arm.t, now.arm.q, now.arm.tip);
+    tip.take(now.arm.t, now.arm.tip);
+    if (fresh) fitts.take(now.arm.t, now.arm.tip, now.t, now.robot?.state === "Engaged" && now.you === true);
+  }
+  if (now.hand) hand.take(now.hand.t, now.hand.p);
+  else hand.clear();
+  measure(now);
+});
+
+/** Four times a second: rates, and how far the arm is behind the hand. */
+function measure(now) {
+  const { arm, sent, robot } = now;
+  if (before && now.t < before.t) before = null;
+  if (before && now.t - before.t < 250) return;
+  const span = before ? (now.t - before.t) / 1000 : null;
+  const rate = (value, was) => (span ? Math.max(0, value - was) / span : null);
+  const following = robot?.state === "Engaged" && now.driving === "hand";
+  const lag = following ? behind(hand, tip) : null;
+  const unhidden = arm && robot ? arm.delay_ms + robot.lag_ms : null;
+  measured = {
+    age: following ? arm?.age_ms : null, delay: arm?.delay_ms, lag,
+    hidden: lag === null ? null : unhidden - lag, clamps: arm?.clamps, lost: arm?.lost, seen: now.seen,
+  };
+  panel.figures(measured);
+  plots.take(now.t, {
+    ...measured, state: now.linked ? robot?.state : null, bytes: rate(sent.bytes, before?.bytes), messages: rate(sent.messages, before?.messages),
+    clamps: arm && before?.clamps <= arm.clamps ? rate(arm.clamps, before.clamps) : 0,
+  });
+  before = { t: now.t, clamps: arm?.clamps ?? 0, ...sent };
+}
+
+// Beside the picture: whether the clutch is held does not depend on how fast the screen is.
+setInterval(() => drive.tick(performance.now()), 8);
+
+function frame(time) {
+  const { now } = link;
+  shown = smooth.at(performance.now()) ?? null;
+  const held = drive.what === "hand" || drive.what === "record";
+  // What the daemon made of the hand lies where the arm is to be; the hand of this very frame is fresher.
+  const offset = now?.offset ?? [0, 0, 0];
+  const place = held && drive.p ? drive.p.map((v, i) => v + (drive.what === "record" ? 0 : offset[i])) : tipShown();
+  if (scene?.due(time)) {
+    scene.draw({
+      arm: link.arm, q: shown?.q, hand: now?.linked ? place : null, held,
+      ghost: held && now?.arm && now.hand ? hand.at(now.t - now.arm.delay_ms) : null,
+      trail: held ? hand.since((now?.hand?.t ?? 0) - 1200).map((s) => s.p) : [],
+      path: now?.path, knots: now?.knots, targets: fitts.targets,
+    });
+  }
+  $("fitts-score").hidden = !fitts.run;
+  $("fitts-score").textContent = fitts.count;
+  plots.draw(time);
+  requestAnimationFrame(frame);
+}
+requestAnimationFrame(frame);
+
+// For whoever tests the page.
+globalThis.telemime = { link, view, scene, drive, fitts, tip: tipShown, hand: () => hand.all.at(-1)?.p ?? null, measured: () => measured };

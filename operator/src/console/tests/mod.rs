@@ -1,0 +1,4 @@
+mod clutch;
+mod guarding;
+mod serving;
+mod wording;
