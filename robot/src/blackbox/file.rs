@@ -334,7 +334,7 @@ impl BlackBox {
             let chunk: Chunk =
                 codec::decode::<_, MAX_CHUNK>(chunk).map_err(content(format!("second {n}")))?;
             if header.home.len() > telemime_sim::arm::MAX_JOINTS
-                || chunk.words.len() % width(header.home.len()) != 0
+                || !chunk.words.len().is_multiple_of(width(header.home.len()))
                 || !chunk.is_sound()
             {
                 return Err(damaged());
