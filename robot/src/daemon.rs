@@ -102,7 +102,7 @@ pub enum Notice {
         /// What the session counted.
         counters: Counters,
         /// What became of its datagrams.
-        seen: Seen,
+        seen: Box<Seen>,
     },
     /// Somebody was turned away: told the first time, and then ever more rarely.
     Refused(Refused),
@@ -518,7 +518,7 @@ impl Daemon {
             .to_session(now)
             .zip(clock.uncertainty_s(now))
             .map(|(t, bound_s)| ((t.0 - now.0) as f64 * 1e-9, bound_s));
-        let (counters, seen) = (ended.counters(), ended.seen());
+        let (counters, seen) = (ended.counters(), Box::new(ended.seen()));
         let _ = notices.send(Notice::Disconnected {
             why: why.to_owned(),
             clock,

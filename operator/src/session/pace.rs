@@ -31,7 +31,7 @@ pub(super) const REPEAT_S: f64 = 0.015;
 
 /// More loss than this is taken for a link that is too thin, whatever it is: to say the same more often would not be fair
 /// to those who share it.
-const CHOKED: f64 = 0.35;
+const CHOKED: f64 = 0.5;
 
 /// Without news of the robot for this long nobody knows what the link lets through, s; once it has reported so often.
 const DEAF_S: f64 = 0.7;
