@@ -14,7 +14,7 @@ use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::arm::WireArm;
-use telemime_protocol::wire::v1::{Cause, Refusal, RobotState, Telemetry};
+use telemime_protocol::wire::v1::{Cause, RobotState, Telemetry};
 use tokio::sync::{mpsc, watch};
 
 use hold::{Hold, Phase};
@@ -22,9 +22,8 @@ use hold::{Hold, Phase};
 use super::snapshot::Seen;
 use super::{Command, Shape, Snapshot};
 use crate::demonstration::{Demonstration, Sample};
-use crate::lessons::{Lesson, LessonError};
 use crate::recognise::{Recogniser, Verdict};
-use crate::session::{Event, HandSample, Session};
+use crate::session::{Event, Session};
 
 /// A page that holds the clutch and is silent for this long has let go, s.
 pub const LEASE_S: f64 = 0.2;
@@ -259,11 +258,11 @@ impl Live {
             // Whoever has lost the clutch may not know it yet.
             Command::Release {} | Command::Alive {} | Command::Hand { .. } if !holds => {}
             Command::Release {} => {}
-            Command::Alive {} => self
-                .hold
-                .as_mut()
-                .into_iter()
-                .for_each(|hold| hold.heard = now),
+            Command::Alive {} => {
+                if let Some(hold) = &mut self.hold {
+                    hold.heard = now;
+                }
+            }
             Command::Hand { t, x } => self.moved(now, t, x, session),
             Command::Reset {} => {
                 let session = session.ok_or("there is no link: reset again when it is back")?;
