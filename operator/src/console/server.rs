@@ -25,7 +25,7 @@ use telemime_protocol::wire::arm::WireArm;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
-use tokio::time::{Instant, sleep, timeout};
+use tokio::time::{Instant, sleep_until, timeout};
 
 use super::command::MAX_COMMAND_LEN;
 use super::files::{FILES, File};
@@ -277,7 +277,7 @@ async fn tell(
             Ok(Err(_)) => return None,
             Err(_) => return Some("the page takes nothing".to_owned()),
         }
-        sleep(FRAME.saturating_sub(begun.elapsed())).await;
+        sleep_until(begun + FRAME).await;
     }
 }
 
@@ -342,7 +342,7 @@ impl Listener for Few {
                     return (Placed { stream, _place }, addr);
                 }
                 // Too many files are open, or the peer is gone: the next, in a moment.
-                _ => sleep(FRAME).await,
+                _ => sleep_until(Instant::now() + FRAME).await,
             }
         }
     }

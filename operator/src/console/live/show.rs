@@ -47,14 +47,12 @@ impl Live {
                 .map(|p| point(&p.position, self.scale * p.sigma_m))
                 .collect()
         });
-        let knots = following
-            .and_then(|_| session)
-            .map_or_else(Vec::new, |session| {
-                let knots = session.recent_knots();
-                knots
-                    .map(|(x, held)| point(&x, f64::from(u8::from(held))))
-                    .collect()
-            });
+        let knots = following.and(session).map_or_else(Vec::new, |session| {
+            let knots = session.recent_knots();
+            knots
+                .map(|(x, held)| point(&x, f64::from(u8::from(held))))
+                .collect()
+        });
         Snapshot {
             t: ms(now),
             linked: self.linked.is_ok(),
