@@ -373,7 +373,6 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
         ),
         (
             "state",
-            "arm",
             message(&RobotControl::State {
                 state: RobotState::Holding,
                 cause: Cause::LeaseExpired,
