@@ -258,11 +258,11 @@ impl Live {
             // Whoever has lost the clutch may not know it yet.
             Command::Release {} | Command::Alive {} | Command::Hand { .. } if !holds => {}
             Command::Release {} => {}
-            Command::Alive {} => self
-                .hold
-                .as_mut()
-                .into_iter()
-                .for_each(|hold| hold.heard = now),
+            Command::Alive {} => {
+                if let Some(hold) = &mut self.hold {
+                    hold.heard = now;
+                }
+            }
             Command::Hand { t, x } => self.moved(now, t, x, session),
             Command::Reset {} => {
                 let session = session.ok_or("there is no link: reset again when it is back")?;
