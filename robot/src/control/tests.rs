@@ -550,7 +550,7 @@ fn dead_time_is_part_of_the_lag_and_the_tip_arrives_when_it_should() {
             ..ControlConfig::default()
         });
         let lag = rig.controller.lag_s();
-        assert!((lag - 3.0 / 45.0 - dead_time_s).abs() < 1e-12);
+        assert!((lag - 3.0 / ControlConfig::default().omega - dead_time_s).abs() < 1e-12);
         let (end, target) = gesture(3, 0.1, rig.start);
         for _ in 0..2000 {
             rig.follow(target(0.0));
@@ -678,11 +678,12 @@ fn a_tip_pressed_on_a_surface_stays_on_it_and_comes_off() {
     );
     assert!(rig.plant.contact_force().z > 10.0 && hardest_n < 1000.0);
     assert!(deepest < 0.04 && rig.plant.qd().amax() < 0.01);
+    // Pressed, it slid and folded by 0.6 rad, which is taken back at a quarter of a radian a second.
     let mut tip = Vector3::zeros();
-    for _ in 0..2000 {
+    for _ in 0..4000 {
         tip = rig.follow(rig.start).tip;
     }
-    assert!((tip - rig.start).norm() < 1e-3, "{tip}");
+    assert!((tip - rig.start).norm() < 1e-3, "{tip} instead of {}", rig.start);
     assert_eq!(rig.plant.contact_force(), Vector3::zeros());
 }
 
