@@ -72,7 +72,13 @@ impl Link {
 impl Seen {
     /// The least round trip counts: what a queue adds is no part of the path, and would have attempts wait for it.
     pub(crate) fn learn(&mut self, connection: &Connection) {
-        self.rtt = self.rtt.min(quic::least_rtt(connection));
+        self.shorten(quic::least_rtt(connection));
+    }
+
+    /// A path that has become shorter has no longer packets for it.
+    fn shorten(&mut self, rtt: Duration) {
+        self.answered = self.answered.saturating_sub(self.rtt.saturating_sub(rtt));
+        self.rtt = self.rtt.min(rtt);
     }
 }
 
@@ -328,6 +334,9 @@ mod tests {
                 answered: ms(answered),
             };
             assert_eq!(Pace::new(Some(seen)).apart, ms(apart));
+            let mut shorter = seen;
+            shorter.shorten(ms(20));
+            assert_eq!(Pace::new(Some(shorter)).apart, ms(apart));
         }
     }
 }

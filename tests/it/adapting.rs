@@ -254,7 +254,7 @@ fn a_link_that_starves_is_spoken_to_less_and_recovers() {
         oldest[1] < 0.65,
         "a queue would grow without end: {oldest:?}"
     );
-    assert!(oldest[2] < 1.3 * oldest[0], "it has recovered: {oldest:?}");
+    assert!(oldest[2] < 1.5 * oldest[0], "it has recovered: {oldest:?}");
 }
 
 #[test]

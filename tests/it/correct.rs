@@ -138,7 +138,9 @@ fn assert_no_leap(reports: &[Report], changes: &[(Mono, Change)]) {
             .map(leap)
             .fold(0.0, f64::max);
         println!("{change:?}: {:.1} mm in a tick", there * 1e3);
-        assert!(there < 0.02, "{there} m at {change:?}");
+        // A message that comes 10 ms early or late is 10 mm of what is let go 0.3 m aside; an ordinary one may move the
+        // target by more.
+        assert!(there < 0.04, "{there} m at {change:?}");
     }
     println!("worst {:.1} mm in a tick", worst * 1e3);
     assert!(worst < 0.05, "{worst} m in a tick");

@@ -281,6 +281,8 @@ impl Session {
         if mirror.future_changed(arrival, bound) {
             self.speak_soon(now);
         } else if silent_s >= self.config.max_silence_s {
+            // It carries the lease: three of them lost in a row stop the arm.
+            self.news = true;
             self.speak(now);
         }
         if let Some(tail) = backlog {
@@ -440,9 +442,10 @@ impl Session {
             self.next_stop = Some(now.offset_by_secs(STOP_REPEAT_S));
             self.datagram(&OperatorDatagram::Stop { epoch: self.epoch });
         }
-        if self.next_word().is_some_and(|due| now >= due)
-            || self.repeat.is_some_and(|due| now >= due)
-        {
+        if self.next_word().is_some_and(|due| now >= due) {
+            self.news = true;
+            self.speak(now);
+        } else if self.repeat.is_some_and(|due| now >= due) {
             self.speak(now);
         }
         if self.next_look().is_some_and(|due| now >= due) {

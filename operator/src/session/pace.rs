@@ -9,8 +9,9 @@ use super::FutureBound;
 /// Loss is remembered over about so many messages.
 const MEMORY: f64 = 40.0;
 
-/// Before anything is known: two copies of a knot.
+/// Before anything is known: two copies of a knot. It counts as this many messages.
 const EXPECTED_LOSS: f64 = 0.01;
+const EXPECTED: f64 = 10.0;
 
 /// So rarely may a knot be missing after all its copies: what is, waits for a round trip.
 const MISSING: f64 = 0.005;
@@ -53,6 +54,8 @@ pub(super) struct Pace {
     burst: f64,
     repeats: bool,
     reports: u32,
+    /// Numbers of the robot's first report and of its newest.
+    back: Option<(u32, u32)>,
     heard: Stamp,
 }
 
@@ -70,6 +73,7 @@ impl Pace {
             burst: 1.0,
             repeats: false,
             reports: 0,
+            back: None,
             heard: Stamp::ZERO,
         }
     }
@@ -77,8 +81,13 @@ impl Pace {
     /// The robot's news.
     pub(super) fn on_telemetry(&mut self, now: Stamp, telemetry: &Telemetry) {
         (self.heard, self.reports) = (now, self.reports.saturating_add(1));
+        let (first, newest) = self.back.unwrap_or((telemetry.seq, telemetry.seq));
+        self.back = Some((first, newest.max(telemetry.seq)));
         let said = telemetry.newest_seq.saturating_sub(self.newest_seq);
         if said == 0 {
+            if self.newest_seq == 0 {
+                self.expect_as_back();
+            }
             return;
         }
         let arrived = f64::from(telemetry.received) - f64::from(self.received);
@@ -87,12 +96,29 @@ impl Pace {
         // A late one makes up for what was taken for lost.
         let loss = self.loss + (said - arrived - said * self.loss) / (MEMORY + said);
         self.loss = loss.clamp(0.0, 1.0);
+        self.decide();
+        let delay_s = f64::from(telemetry.delay_ms) * 1e-3;
+        let choked = self.loss > CHOKED;
+        // 0 says that the robot does not know yet; as the least delay it would make a queue of every link's length.
+        if telemetry.delay_ms > 0 {
+            self.pacer.observe(now.as_secs_f64(), delay_s, choked);
+        }
+    }
+
+    /// Nothing has arrived there yet, but the robot's reports have here: on most links one way loses as the other does, and
+    /// three messages in a row must not be lost before that is known.
+    fn expect_as_back(&mut self) {
+        let (first, newest) = self.back.unwrap_or_default();
+        let said = f64::from(newest - first) + 1.0;
+        let lost = (said - f64::from(self.reports)).max(0.0);
+        self.loss = (lost + EXPECTED * EXPECTED_LOSS) / (said + EXPECTED);
+        self.decide();
+    }
+
+    fn decide(&mut self) {
         self.repeats = self.loss > REPEAT_FROM
             || self.is_bursty()
             || (self.repeats && self.loss > REPEAT_UNTIL);
-        let delay_s = f64::from(telemetry.delay_ms) * 1e-3;
-        let choked = self.loss > CHOKED;
-        self.pacer.observe(now.as_secs_f64(), delay_s, choked);
     }
 
     /// What has become of everything said so far.
@@ -225,6 +251,36 @@ mod tests {
         assert!(bursts.copies() > 2 && bursts.repeats(), "{bursts:?}");
         let start = Pace::new(0.01, 0.2);
         assert_eq!((start.copies(), start.repeats()), (2, false));
+    }
+
+    #[test]
+    fn a_long_link_is_no_queue() {
+        let mut pace = Pace::new(0.01, 0.2);
+        for i in 1..40 {
+            let delay_ms = if i < 3 { 0 } else { 250 };
+            pace.on_telemetry(
+                Stamp::from_secs_f64(0.05 * f64::from(i)),
+                &heard(i, i, delay_ms),
+            );
+        }
+        assert_eq!(pace.pacer.interval_s(), 0.01);
+    }
+
+    #[test]
+    fn before_anything_was_said_the_way_back_is_what_is_known() {
+        let after = |lost: fn(u32) -> bool| {
+            let mut pace = Pace::new(0.01, 0.2);
+            for seq in (1..=40).filter(|seq| !lost(*seq)) {
+                let telemetry = Telemetry {
+                    seq,
+                    ..heard(0, 0, 50)
+                };
+                pace.on_telemetry(Stamp::from_secs_f64(0.05 * f64::from(seq)), &telemetry);
+            }
+            (pace.copies(), pace.repeats())
+        };
+        assert_eq!(after(|_| false), (1, false));
+        assert_eq!(after(|seq| seq % 5 == 2), (3, true));
     }
 
     #[test]

@@ -683,7 +683,11 @@ fn a_tip_pressed_on_a_surface_stays_on_it_and_comes_off() {
     for _ in 0..4000 {
         tip = rig.follow(rig.start).tip;
     }
-    assert!((tip - rig.start).norm() < 1e-3, "{tip} instead of {}", rig.start);
+    assert!(
+        (tip - rig.start).norm() < 1e-3,
+        "{tip} instead of {}",
+        rig.start
+    );
     assert_eq!(rig.plant.contact_force(), Vector3::zeros());
 }
 

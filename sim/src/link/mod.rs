@@ -364,7 +364,9 @@ impl Link {
                 len = (cells * (i64::from(set.cell) + i64::from(set.cell_overhead))).max(0);
             }
         }
-        (len as u64 * 1_000_000_000 / rate) as i64
+        // The kernel's product wraps; a packet that would take centuries waits for them.
+        let ns = u128::from(len as u64) * 1_000_000_000 / u128::from(rate);
+        i64::try_from(ns).unwrap_or(i64::MAX)
     }
 
     /// When what is due at `due_ns` leaves (`netem_dequeue`).
