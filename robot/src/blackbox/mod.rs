@@ -1,7 +1,7 @@
 //! The black box: all that the servo was told and decided in the last minutes, and the same again from a file.
 //!
 //! A [`Tap`] on the tick copies its inputs and outcome into rings; a [`Recorder`] elsewhere keeps them, a second to a chunk that begins with the
-//! core's whole state, and lets go of the oldest. [`file`](self::file) writes them; [`replay`] runs the same core on them again.
+//! core's whole state, and lets go of the oldest. [`mod@file`] writes them; [`mod@replay`] runs the same core on them again.
 
 pub mod file;
 mod recorder;
