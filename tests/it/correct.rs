@@ -121,7 +121,7 @@ fn named(changes: &[(Mono, Change)]) -> Vec<Change> {
     changes.iter().map(|(_, change)| *change).collect()
 }
 
-/// The target never leaps, hand metres a tick, least of all when something changes.
+/// The target never leaps, hand metres a tick, and what changes moves it no more than any other message may.
 fn assert_no_leap(reports: &[Report], changes: &[(Mono, Change)]) {
     let leap = |w: &[Report]| (w[1].target_m - w[0].target_m).norm() / w[1].mapping.scale;
     let playing: Vec<_> = reports
