@@ -1,7 +1,7 @@
 """Every message of version 1 (§4, §5), field by field."""
 
 from . import path
-from .codec import (F32, I8, I32, I64, U8, U16, U32, Array, Bytes, Enum, Option, Struct, Text, Vec, WireError, decode, encode, finite, require)
+from .codec import (F32, I8, I32, I64, U8, U16, U32, U64, Array, Bytes, Enum, Option, Struct, Text, Vec, WireError, decode, encode, finite, require)
 from .frames import LONGEST
 from .state import PARAMS, POSE, ROTATION, STATE, _rotation_range
 
