@@ -104,6 +104,10 @@ pub struct Args {
     /// Bandwidth of the filter between prediction and arm, rad/s: less is smoother, and farther behind [default: 40].
     #[arg(long, value_name = "RAD_S")]
     pub bandwidth: Option<f64>,
+    /// Joint impedance instead of computed torque: the strongest joint is a spring of this stiffness, N·m/rad, the others in
+    /// proportion to their effort limits; what the arm runs into is pushed softly.
+    #[arg(long, value_name = "NM_RAD")]
+    pub stiffness: Option<f64>,
     /// Speak protocol versions up to this one; 2 is an experiment [default: 1].
     #[arg(long, value_name = "N")]
     pub protocol_max: Option<u16>,
@@ -158,6 +162,7 @@ struct File {
     contact_plane: Option<[f64; 4]>,
     dead_time_s: Option<f64>,
     bandwidth_rad_s: Option<f64>,
+    stiffness_nm_rad: Option<f64>,
     protocol_max: Option<u16>,
     record: Option<PathBuf>,
     driver: Option<String>,
@@ -264,6 +269,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
                 .bandwidth
                 .or(file.bandwidth_rad_s)
                 .unwrap_or(ControlConfig::default().omega),
+            stiffness: args.stiffness.or(file.stiffness_nm_rad),
             barrier,
             ..ControlConfig::default()
         },
