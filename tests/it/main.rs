@@ -8,6 +8,7 @@ mod adapting;
 mod alignment;
 mod arms;
 mod blackbox;
+mod book;
 mod codec;
 mod commands;
 mod correct;
