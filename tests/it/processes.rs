@@ -179,6 +179,11 @@ impl Stage {
     }
 
     pub(crate) fn operator(&self, addr: &str, key: &str) -> Process {
+        self.operator_with(addr, key, &[])
+    }
+
+    /// The same with more flags.
+    pub(crate) fn operator_with(&self, addr: &str, key: &str, flags: &[&str]) -> Process {
         let config = format!(
             "connect = {addr:?}\nidentity = {:?}\npeer = {:?}\nlearn = [{:?}]\nreplay = {:?}\npatience_s = 5.0\n",
             self.text(&format!("{key}.key")),
@@ -187,13 +192,9 @@ impl Stage {
             self.text("unseen.csv"),
         );
         std::fs::write(self.path("operator.toml"), config).unwrap();
-        Process::start(&[
-            "operator",
-            "--config",
-            &self.text("operator.toml"),
-            "--json",
-            "--follow-stdin",
-        ])
+        let config = self.text("operator.toml");
+        let first = ["operator", "--config", &config, "--json", "--follow-stdin"];
+        Process::start(&[&first, flags].concat())
     }
 }
 
