@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use axum::Router;
-use axum::body::Body;
+use axum::body::{Body, Bytes};
 use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade};
 use axum::extract::{Path, Request, State};
 use axum::http::header::{self, HeaderMap, HeaderValue};
@@ -18,7 +18,7 @@ use axum::routing::get;
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
 use serde::Serialize;
-use telemime_endpoint::http::Few;
+use telemime_endpoint::http::{self, Limits};
 use telemime_protocol::wire::arm::WireArm;
 use tokio::sync::{Semaphore, mpsc};
 use tokio::time::{Instant, sleep_until, timeout};
@@ -39,6 +39,15 @@ const FRAME: Duration = Duration::from_millis(25);
 
 /// A page that takes nothing for this long is left.
 const STALLED: Duration = Duration::from_secs(5);
+
+/// A connection has this long for each request, the pause before it included.
+const REQUEST: Duration = Duration::from_secs(5);
+
+/// A page is asked whether it is still there this often …
+const PING: Duration = Duration::from_secs(5);
+
+/// … and has gone if nothing came from it for this long.
+const GONE: Duration = Duration::from_secs(15);
 
 /// A page that is left gets this long to hear why.
 const FAREWELL: Duration = Duration::from_secs(1);
@@ -106,8 +115,12 @@ pub fn serve(addr: SocketAddr, random: [u8; 16], port: Port) -> Result<String, S
         .spawn(move || {
             runtime.block_on(async {
                 if let Ok(listener) = tokio::net::TcpListener::from_std(listener) {
-                    let listener = Few::new(listener, MAX_CONNECTIONS, None);
-                    let _ = axum::serve(listener, router(shared)).await;
+                    let limits = Limits {
+                        connections: MAX_CONNECTIONS,
+                        request: REQUEST,
+                        stay: None,
+                    };
+                    http::serve(listener, router(shared), limits).await;
                 }
             });
         })?;
@@ -160,10 +173,11 @@ fn text(headers: &HeaderMap, name: header::HeaderName) -> Option<&str> {
     headers.get(name).map(|value| value.to_str().unwrap_or("?"))
 }
 
-/// The token becomes a cookie, so that it does not stay in the address bar and the history.
+/// The token becomes a cookie, so that it does not stay in the address bar and the history. Lax, or whoever follows the
+/// address from a message would be asked again; that the socket is opened by our own page is the Origin's to show.
 fn welcomed(guard: &Guard, uri: &Uri) -> Response {
     let cookie = guard.cookie().unwrap_or_default();
-    let cookie = format!("{cookie}; HttpOnly; SameSite=Strict; Path=/");
+    let cookie = format!("{cookie}; HttpOnly; SameSite=Lax; Path=/");
     let headers = [
         (header::SET_COOKIE, cookie),
         (header::LOCATION, uri.path().to_owned()),
@@ -246,9 +260,23 @@ async fn tell(
     let mut snapshots = shared.port.snapshots.clone();
     snapshots.mark_changed();
     let mut told: Option<Arc<WireArm>> = None;
+    let mut ping = Instant::now() + PING;
     loop {
-        snapshots.changed().await.ok()?;
+        let shown = tokio::select! {
+            shown = snapshots.changed() => Some(shown.ok()?),
+            () = sleep_until(ping) => None,
+        };
         let begun = Instant::now();
+        if begun >= ping {
+            ping = begun + PING;
+            match timeout(STALLED, out.send(Message::Ping(Bytes::new()))).await {
+                Ok(Ok(())) => {}
+                _ => return None,
+            }
+        }
+        if shown.is_none() {
+            continue;
+        }
         let snapshot = Arc::clone(&snapshots.borrow_and_update());
         let built = snapshot.built.as_ref();
         let fresh =
@@ -281,7 +309,7 @@ async fn listen(
 ) -> Option<String> {
     let (mut second, mut count, mut wrong) = (Instant::now(), 0, 0);
     loop {
-        let message = match heard.next().await {
+        let message = match timeout(GONE, heard.next()).await.ok()? {
             Some(Ok(message)) => message,
             // Too long, or not a WebSocket any more.
             Some(Err(e)) => return Some(e.to_string().chars().take(100).collect()),
@@ -301,6 +329,10 @@ async fn listen(
             Message::Binary(_) => Command::parse(""),
         };
         match command {
+            // A stop waits for its place, and only its own page with it.
+            Ok(command @ Command::Stop {}) => {
+                drop(commands.send((number, Said::Command(command))).await);
+            }
             // Full: the daemon is behind, and what it does not hear is not obeyed.
             Ok(command) => drop(commands.try_send((number, Said::Command(command)))),
             Err(why) => {

@@ -53,7 +53,6 @@ pub struct Snapshot {
     seen: Seen,
     counts: Counts,
     clamps: u32,
-    overruns: u32,
 }
 
 impl Daemon {
@@ -87,7 +86,7 @@ impl Daemon {
                 }
                 Event::Telemetry(telemetry) => {
                     snapshot.state = Some(telemetry.state);
-                    (snapshot.clamps, snapshot.overruns) = (telemetry.clamps, telemetry.overruns);
+                    snapshot.clamps = telemetry.clamps;
                 }
                 _ => {}
             }
@@ -223,7 +222,7 @@ impl Snapshot {
         page.gauge(
             "robot_tick_overruns",
             "The robot's ticks that began more than a period late, as it says.",
-            self.overruns,
+            self.seen.servo.map_or(0, |servo| servo.overruns),
         );
         page.text()
     }

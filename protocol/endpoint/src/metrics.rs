@@ -11,7 +11,7 @@ use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
 use axum::routing::get;
 
-use crate::http::Few;
+use crate::http::{self, Limits};
 use crate::reception::{Quantiles, Received};
 
 /// Scrapers at once; more wait.
@@ -197,8 +197,12 @@ pub fn serve(
         .spawn(move || {
             runtime.block_on(async {
                 if let Ok(listener) = tokio::net::TcpListener::from_std(listener) {
-                    let listener = Few::new(listener, MAX_SCRAPERS, Some(STAY));
-                    let _ = axum::serve(listener, router).await;
+                    let limits = Limits {
+                        connections: MAX_SCRAPERS,
+                        request: STAY,
+                        stay: Some(STAY),
+                    };
+                    http::serve(listener, router, limits).await;
                 }
             });
         })?;

@@ -36,7 +36,7 @@ const OPERATOR: [&str; 14] = [
 ];
 
 /// What a robot says.
-const ROBOT: [&str; 11] = [
+const ROBOT: [&str; 12] = [
     "arm",
     "engaged",
     "info",
@@ -46,6 +46,7 @@ const ROBOT: [&str; 11] = [
     "plan_stored",
     "reception",
     "refused",
+    "servo",
     "state",
     "telemetry",
 ];
@@ -184,6 +185,7 @@ impl Tally {
             Some(RobotDatagram::Ping { .. }) => "ping",
             Some(RobotDatagram::Telemetry(_)) => "telemetry",
             Some(RobotDatagram::Reception(_)) => "reception",
+            Some(RobotDatagram::Servo(_)) => "servo",
             None => "malformed",
         };
         add(&mut self.robot, kind, bytes);
