@@ -144,13 +144,13 @@ fn refused(
             }
         }
         Refusal::OurKeyUnknown => Finding::fail(
-            what,
-            "it does not know our key",
+            "our identity",
+            "the robot does not know our key",
             "pair (telemime pair HOST:PORT), or give our fingerprint (telemime identity) to its --peer",
         ),
         Refusal::OurKeyRevoked => Finding::fail(
-            what,
-            "it has revoked our key",
+            "our identity",
+            "the robot has revoked our key",
             "telemime peers remove on the robot's host, and pair again",
         ),
         Refusal::Version => Finding::fail(

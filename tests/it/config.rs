@@ -340,9 +340,9 @@ fn a_configuration_is_checked_line_by_line_and_explained() {
 
     let environment = [
         ("TELEMIME_ROBOT_NAME", "by-variable"),
-        ("TELEMIME_ROBOT_TIP", "tool0"),
+        ("TELEMIME_ROBOT_TIP", "tool"),
     ];
-    let flags = ["--explain", "--json", "--", "--tip", "tool0"];
+    let flags = ["--explain", "--json", "--", "--tip", "tcp"];
     let (code, (out, _)) = check(
         "name = \"by-file\"\nbandwidth_rad_s = 30\n",
         &flags,
@@ -359,7 +359,7 @@ fn a_configuration_is_checked_line_by_line_and_explained() {
         )
     };
     let pair = |a: &str, b: &str| (a.to_owned(), b.to_owned());
-    assert_eq!(origin("tip"), pair("tool0", "flag"));
+    assert_eq!(origin("tip"), pair("tcp", "flag"));
     assert_eq!(origin("name"), pair("\"by-variable\"", "environment"));
     assert_eq!(origin("bandwidth_rad_s"), pair("30", "file"));
     assert_eq!(origin("dead_time_s"), pair("0.0", "default"));

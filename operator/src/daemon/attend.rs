@@ -2,7 +2,7 @@
 
 use telemime_endpoint::meter::Counts;
 use telemime_endpoint::metrics::Page;
-use telemime_endpoint::tally::{CAUSES, STATES, Tally};
+use telemime_endpoint::tally::{CAUSES, STATES, Tally, is_stop};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::RobotState;
 
@@ -46,7 +46,9 @@ pub struct Snapshot {
     sessions: u64,
     engagements: u64,
     state: Option<RobotState>,
-    /// The robot's ways into `Holding` and `Stopped` that were heard of, by the order of [`CAUSES`].
+    /// What the stream said last.
+    told: Option<RobotState>,
+    /// By the order of [`CAUSES`].
     stops: [u64; CAUSES.len()],
     past: Sums,
     sums: Sums,
@@ -78,7 +80,8 @@ impl Daemon {
                 Event::Engaged { .. } => snapshot.engagements += 1,
                 Event::State(state, cause) => {
                     snapshot.state = Some(*state);
-                    let stops = matches!(state, RobotState::Holding | RobotState::Stopped);
+                    // Telemetry may be ahead of the stream, and tells of no cause.
+                    let stops = is_stop(snapshot.told.replace(*state), *state);
                     let which = CAUSES.iter().position(|(known, _)| known == cause);
                     if let Some(i) = which.filter(|_| stops) {
                         snapshot.stops[i] += 1;
@@ -116,7 +119,7 @@ impl Daemon {
     pub(super) fn ended(&self, session: &Session) {
         self.show(|snapshot| {
             snapshot.connected = false;
-            snapshot.state = None;
+            (snapshot.state, snapshot.told) = (None, None);
             snapshot.past = snapshot.past.with(session).no_less_than(&snapshot.sums);
             snapshot.sums = snapshot.past.clone();
             snapshot.seen = session.seen();
@@ -157,7 +160,7 @@ impl Snapshot {
         let stops = CAUSES.iter().zip(self.stops);
         page.each(
             ("robot_stops_total", "counter"),
-            "The robot's stops (into holding or stopped) that were heard of, by cause.",
+            "Ends of following, and emergency stops, that were heard of, by cause.",
             "cause",
             stops.map(|((_, word), times)| (word, times)),
         );

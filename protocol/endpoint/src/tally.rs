@@ -91,6 +91,14 @@ pub const CAUSES: [(Cause, &str); 11] = [
     (Cause::ArmFault, "arm_fault"),
 ];
 
+/// Whether an arm that was in `before` and is in `now` has been stopped: it followed and does so no longer, or the
+/// emergency stop was pulled.
+pub fn is_stop(before: Option<RobotState>, now: RobotState) -> bool {
+    let follows = |state| matches!(state, RobotState::Engaged | RobotState::Coasting);
+    let stopped = now == RobotState::Stopped && before != Some(now);
+    stopped || (before.is_some_and(follows) && !follows(now))
+}
+
 fn refusal(reason: Refusal) -> &'static str {
     match reason {
         Refusal::Stopped => "stopped",
@@ -245,5 +253,61 @@ impl Tally {
             "reason",
             self.refused.iter(),
         );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stop_is_the_end_of_following_or_the_emergency_stop() {
+        use RobotState::{Coasting, Engaged, Holding, Idle, Ready, Stopped};
+        for (before, now) in [
+            (Engaged, Ready),
+            (Engaged, Holding),
+            (Coasting, Holding),
+            (Engaged, Stopped),
+            (Idle, Stopped),
+        ] {
+            assert!(is_stop(Some(before), now), "{before:?} {now:?}");
+        }
+        for (before, now) in [
+            (Engaged, Coasting),
+            (Coasting, Engaged),
+            (Ready, Engaged),
+            (Holding, Ready),
+            (Stopped, Stopped),
+            (Stopped, Ready),
+        ] {
+            assert!(!is_stop(Some(before), now), "{before:?} {now:?}");
+        }
+        assert!(!is_stop(None, Idle));
+    }
+
+    #[test]
+    fn sums_keep_every_kind_and_say_those_that_never_came() {
+        let mut one = Tally::default();
+        one.operator_control(Some(&OperatorControl::Goodbye), 1);
+        one.robot_control(
+            Some(&RobotControl::Refused {
+                reason: Refusal::Moving,
+            }),
+            2,
+        );
+        one.operator_datagram(None, 9);
+        let both = one.clone().plus(&one);
+        let mut page = Page::new("x_");
+        both.show(&mut page, true);
+        let text = page.text();
+        for line in [
+            "x_messages_received_total{kind=\"goodbye\"} 2",
+            "x_message_bytes_received_total{kind=\"malformed\"} 18",
+            "x_messages_received_total{kind=\"motion\"} 0",
+            "x_message_bytes_sent_total{kind=\"refused\"} 4",
+            "x_requests_refused_total{reason=\"moving\"} 2",
+        ] {
+            assert!(text.lines().any(|l| l == line), "{line} in {text}");
+        }
     }
 }

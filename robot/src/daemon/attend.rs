@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use telemime_endpoint::metrics::Page;
 use telemime_endpoint::supervisor::Supervisor;
-use telemime_endpoint::tally::{CAUSES, STATES, Tally};
+use telemime_endpoint::tally::{CAUSES, STATES, Tally, is_stop};
 use telemime_endpoint::{Meter, Mono};
 use telemime_protocol::wire::v1::RobotState;
 use tokio::sync::watch;
@@ -25,7 +25,7 @@ pub struct Snapshot {
     connected: bool,
     sessions: u64,
     engagements: u64,
-    /// Ways into `Holding` and `Stopped`, by the order of [`CAUSES`].
+    /// By the order of [`CAUSES`].
     stops: [u64; CAUSES.len()],
     clamps: u64,
     faulty: bool,
@@ -73,7 +73,7 @@ impl Attendant {
     /// A tick has been reported.
     pub(super) fn saw(&mut self, report: &Report) {
         let past = &mut self.past;
-        past.state = Some(report.state);
+        let before = past.state.replace(report.state);
         past.faulty = report.fault.is_some();
         if self.engagement != report.engagement {
             self.engagement = report.engagement;
@@ -83,7 +83,7 @@ impl Attendant {
         past.clamps += u64::from(report.clamps.saturating_sub(self.clamps));
         self.clamps = report.clamps;
         if self.transitions.replace(report.transitions) != Some(report.transitions)
-            && matches!(report.state, RobotState::Holding | RobotState::Stopped)
+            && is_stop(before, report.state)
             && let Some(i) = CAUSES.iter().position(|(cause, _)| *cause == report.cause)
         {
             past.stops[i] += 1;
@@ -173,7 +173,7 @@ impl Snapshot {
         let stops = CAUSES.iter().zip(self.stops);
         page.each(
             ("stops_total", "counter"),
-            "Stops (into holding or stopped), by cause; requested is the operator's letting go.",
+            "Ends of following, and emergency stops, by cause; requested is the operator's letting go.",
             "cause",
             stops.map(|((_, word), times)| (word, times)),
         );
