@@ -236,7 +236,9 @@ fn shapes<D: Settings>() {
             other => panic!("{other:?}"),
         };
         match (&shape["enum"], &shape["anyOf"]) {
-            (Value::Array(words), _) => words.iter().any(|word| word.to_string() == value),
+            (Value::Array(words), _) => words
+                .iter()
+                .any(|word| word.as_str() == Some(value.trim_matches('"'))),
             (_, Value::Array(any)) => any.iter().any(one),
             _ => one(shape),
         }
