@@ -315,7 +315,10 @@ impl Writer {
         let publish = Stamp(telemetry.t_us.saturating_mul(1000));
         let at = At { log: now, publish };
         if let Some(drawn) = &self.drawn {
-            if self.scene.is_none_or(|last| now.secs_since(last) >= SCENE_S) {
+            if self
+                .scene
+                .is_none_or(|last| now.secs_since(last) >= SCENE_S)
+            {
                 self.scene = Some(now);
                 tape.message("/operator/arm", at, &drawn.scene(publish))?;
             }

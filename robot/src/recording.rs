@@ -105,7 +105,8 @@ impl Scribe {
     /// Takes the report of a tick, and what the session that is under way knows.
     pub fn take(&mut self, report: &Report, session: Option<&Session>) {
         let changed = self.transitions.replace(report.transitions) != Some(report.transitions);
-        let engaged = std::mem::replace(&mut self.engagement, report.engagement) != report.engagement;
+        let engaged =
+            std::mem::replace(&mut self.engagement, report.engagement) != report.engagement;
         let fault = report.fault.filter(|_| !self.faulty);
         self.faulty |= report.fault.is_some();
         if let Some(t) = session.and_then(|session| session.clock().to_session(report.at)) {

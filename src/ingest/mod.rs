@@ -13,8 +13,8 @@ use telemime_endpoint::cli::one_line;
 use telemime_endpoint::recording;
 use telemime_operator::ingest::segment::Method;
 use telemime_operator::ingest::{
-    Axes, Columns, Cut, Fault, Format, Imported, IngestError, LengthUnit, MAX_GAP_S, Options, Report,
-    TimeUnit, import,
+    Axes, Columns, Cut, Fault, Format, Imported, IngestError, LengthUnit, MAX_GAP_S, Options,
+    Report, TimeUnit, import,
 };
 
 /// Make demonstrations of raw recordings: Kinect or OpenNI skeletons, tables of a hand's path, or what the operator daemon
@@ -234,7 +234,10 @@ fn expanded(given: &[PathBuf]) -> anyhow::Result<Vec<PathBuf>> {
             }
         }
         if inside.is_empty() {
-            bail!("{}: no .txt, .csv, .tsv or .mcap in this folder", path.display());
+            bail!(
+                "{}: no .txt, .csv, .tsv or .mcap in this folder",
+                path.display()
+            );
         }
         inside.sort();
         all.append(&mut inside);

@@ -24,11 +24,7 @@ pub(super) fn ticks(path: Option<&Path>, rig: &Rig) -> anyhow::Result<Option<Tic
 }
 
 /// A recording that viewers open, if that is what is wanted.
-pub(super) fn scribe(
-    path: Option<&Path>,
-    rig: &Rig,
-    log: &Log,
-) -> anyhow::Result<Option<Scribe>> {
+pub(super) fn scribe(path: Option<&Path>, rig: &Rig, log: &Log) -> anyhow::Result<Option<Scribe>> {
     let Some(path) = path.filter(|path| recording::is_named(path)) else {
         return Ok(None);
     };

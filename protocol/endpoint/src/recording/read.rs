@@ -144,8 +144,7 @@ pub fn read(path: &Path, mut each: impl FnMut(Message<'_>)) -> Result<Contents, 
             }
             LinearReadEvent::Record { opcode, data } => (opcode, data),
         };
-        let record =
-            mcap::parse_record(opcode, data).map_err(|e| broken(e, contents.messages))?;
+        let record = mcap::parse_record(opcode, data).map_err(|e| broken(e, contents.messages))?;
         match record {
             Record::Schema { header, .. } => {
                 schemas.insert(header.id, header.name);

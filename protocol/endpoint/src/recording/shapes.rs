@@ -31,7 +31,11 @@ pub struct Drawn {
 impl Drawn {
     /// `arm`, whose moving joints are called `names`, base first; a joint without a name is called by its number.
     pub fn new(arm: WireArm, look: Look, names: &[&str]) -> Self {
-        let name = |i: usize| names.get(i).map_or_else(|| format!("joint{}", i + 1), |n| (*n).to_owned());
+        let name = |i: usize| {
+            names
+                .get(i)
+                .map_or_else(|| format!("joint{}", i + 1), |n| (*n).to_owned())
+        };
         Self {
             names: (0..arm.joints.len()).map(name).collect(),
             arm,
@@ -49,9 +53,15 @@ impl Drawn {
 
     /// Every link in the one before it, the tip last, at joint values `q`, rad or m.
     pub fn transforms(&self, t: Stamp, q: &[f64]) -> FrameTransforms {
-        let moved = self.arm.joints.iter().zip(q).enumerate().map(|(i, (joint, q))| {
-            transform(t, self.frame(i), self.frame(i + 1), &after(joint, *q))
-        });
+        let moved = self
+            .arm
+            .joints
+            .iter()
+            .zip(q)
+            .enumerate()
+            .map(|(i, (joint, q))| {
+                transform(t, self.frame(i), self.frame(i + 1), &after(joint, *q))
+            });
         let tip = transform(
             t,
             self.frame(self.arm.joints.len()),
@@ -96,7 +106,9 @@ impl Drawn {
         let entities = (0..=self.arm.joints.len()).map(entity);
         SceneUpdate {
             deletions: Vec::new(),
-            entities: entities.filter(|entity| !entity.spheres.is_empty()).collect(),
+            entities: entities
+                .filter(|entity| !entity.spheres.is_empty())
+                .collect(),
         }
     }
 
@@ -118,8 +130,9 @@ impl Drawn {
         }
         entity.spheres.push(ball(&to));
         // Where they are opposite, any half turn does.
-        let turn = UnitQuaternion::rotation_between(&V3::z(), &along)
-            .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&V3::x_axis(), std::f64::consts::PI));
+        let turn = UnitQuaternion::rotation_between(&V3::z(), &along).unwrap_or_else(|| {
+            UnitQuaternion::from_axis_angle(&V3::x_axis(), std::f64::consts::PI)
+        });
         entity.cylinders.push(CylinderPrimitive {
             pose: Some(pose(&(0.5 * (from + to)), &turn)),
             size: size(along.norm()),

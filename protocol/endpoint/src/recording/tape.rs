@@ -166,7 +166,11 @@ impl Tape {
         let due = self
             .flushed
             .is_some_and(|at| self.newest.secs_since(at) >= FLUSH_S);
-        let Some(open) = self.open.as_mut().filter(|_| self.unflushed && (due || idle)) else {
+        let Some(open) = self
+            .open
+            .as_mut()
+            .filter(|_| self.unflushed && (due || idle))
+        else {
             return Ok(());
         };
         (self.flushed, self.unflushed) = (Some(self.newest), false);
@@ -181,9 +185,7 @@ impl Tape {
                     ("messages".to_owned(), self.messages.to_string()),
                     ("dropped".to_owned(), self.dropped.to_string()),
                 ]);
-                open.finish(about)
-                    .err()
-                    .map(|source| self.failed(source))
+                open.finish(about).err().map(|source| self.failed(source))
             }
             (Some(open), Some(error)) => {
                 open.abandon();
@@ -296,7 +298,11 @@ impl Open {
         self.writer.write_to_known_channel(&header, data)
     }
 
-    fn metadata(&mut self, name: &str, metadata: BTreeMap<String, String>) -> Result<(), McapError> {
+    fn metadata(
+        &mut self,
+        name: &str,
+        metadata: BTreeMap<String, String>,
+    ) -> Result<(), McapError> {
         self.writer.write_metadata(&Metadata {
             name: name.to_owned(),
             metadata,

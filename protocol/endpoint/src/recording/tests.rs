@@ -70,7 +70,10 @@ fn what_is_written_is_read_back_with_both_times() {
     assert_eq!((outcome.messages, outcome.dropped), (600, 0));
     assert!(outcome.error.is_none(), "{outcome:?}");
     let (all, contents) = hands(&path);
-    assert_eq!(all, (0..300).map(|i| hand(1000 + 10 * i)).collect::<Vec<_>>());
+    assert_eq!(
+        all,
+        (0..300).map(|i| hand(1000 + 10 * i)).collect::<Vec<_>>()
+    );
     assert!(contents.complete);
     assert_eq!(contents.metadata[tape::ABOUT]["role"], "test");
     assert_eq!(contents.metadata[tape::END]["dropped"], "0");
@@ -119,7 +122,9 @@ fn another_clock_begins_another_file_beside() {
         write(tape, ms)
     };
     let recording = Recording::start(&path, about(), roll, move |o| drop(tx.send(o))).unwrap();
-    [5000, 5010, 0, 1000].into_iter().for_each(|ms| recording.push(ms));
+    [5000, 5010, 0, 1000]
+        .into_iter()
+        .for_each(|ms| recording.push(ms));
     drop(recording);
     let ended: Vec<_> = rx.iter().map(|o| (o.path, o.messages)).collect();
     let third = dir.path().join("a-3.mcap");
@@ -150,7 +155,11 @@ fn a_file_that_is_cut_off_anywhere_gives_all_that_was_whole() {
             Ok(contents) => {
                 let (all, _) = hands(&cut);
                 assert!(!contents.complete && all.len() <= last);
-                assert!(all.iter().enumerate().all(|(i, h)| *h == hand(1000 + 10 * i as i64)));
+                assert!(
+                    all.iter()
+                        .enumerate()
+                        .all(|(i, h)| *h == hand(1000 + 10 * i as i64))
+                );
                 last = all.len();
             }
             Err(ReadError::NotMcap { .. }) => assert!(len < 200, "{len}"),
@@ -283,7 +292,12 @@ fn frames_joined_from_base_to_tip_are_the_arm_s_kinematics() {
     assert_eq!(parent, "tip");
     let error = at.translation.vector - Vector3::new(0.0, 1.75, 0.5);
     assert!(error.norm() < 1e-6, "{at}");
-    let names: Vec<_> = drawn.joints(t(0), &q).joints.into_iter().map(|j| j.name).collect();
+    let names: Vec<_> = drawn
+        .joints(t(0), &q)
+        .joints
+        .into_iter()
+        .map(|j| j.name)
+        .collect();
     assert_eq!(names, ["turn", "joint2"]);
     let SceneUpdate { entities, .. } = drawn.scene(t(0));
     let shapes: Vec<_> = entities
