@@ -124,7 +124,7 @@ fn what_was_driven_is_recorded_imported_and_learned() {
     );
 
     // What was sampled is there, every sample of it.
-    let driven = Demonstration::read_csv(&stage.path("unseen.csv")).unwrap();
+    let driven = Demonstration::read_csv(stage.path("unseen.csv")).unwrap();
     let hands: Vec<Hand> = json(Path::new(&of_operator), "/operator/hand");
     let hands: Vec<_> = hands.iter().filter(|hand| !hand.resting).collect();
     assert_eq!(hands.len(), driven.samples().len());
@@ -168,7 +168,7 @@ fn what_was_driven_is_recorded_imported_and_learned() {
     let imported = telemime(&["import", &of_operator, "-o", &folder, "--keep-glitches"]);
     let said = String::from_utf8_lossy(&imported.stderr).into_owned();
     assert!(imported.status.success(), "{said}");
-    let again = Demonstration::read_csv(&stage.path("monday/screw.csv")).unwrap();
+    let again = Demonstration::read_csv(stage.path("monday/screw.csv")).unwrap();
     assert!(
         again.samples().len() + 2 >= driven.samples().len(),
         "{}",
@@ -229,8 +229,8 @@ fn a_killed_process_leaves_a_recording_that_can_be_read_and_learned_from() {
         imported.status.success() && said.contains("cut off"),
         "{said}"
     );
-    let driven = Demonstration::read_csv(&stage.path("unseen.csv")).unwrap();
-    let saved = Demonstration::read_csv(&stage.path("monday/screw.csv")).unwrap();
+    let driven = Demonstration::read_csv(stage.path("unseen.csv")).unwrap();
+    let saved = Demonstration::read_csv(stage.path("monday/screw.csv")).unwrap();
     println!(
         "{:.2} s of {:.2} s",
         saved.duration_s(),
