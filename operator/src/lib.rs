@@ -12,6 +12,7 @@ pub mod lessons;
 pub mod placed;
 pub mod program;
 pub mod recognise;
+pub mod recording;
 pub mod session;
 pub mod skill_file;
 pub mod tap;

@@ -109,7 +109,8 @@ pub struct Args {
     /// Speak protocol versions up to this one; 2 is an experiment [default: 1].
     #[arg(long, value_name = "N")]
     pub protocol_max: Option<u16>,
-    /// Write every tick to this CSV file.
+    /// Record into this new file: NAME.mcap, a recording that Foxglove, Lichtblick and rerun open; any other name, every
+    /// tick as CSV.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
     /// Drive a real arm: this command (run by sh) tells its joints' state and takes setpoints, a JSON line each; docs/driver.md.
@@ -235,11 +236,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
             logs::note(&notice.to_string());
         }
     }
-    let recorder = args
-        .record
-        .clone()
-        .map(|path| TickRecorder::start(&path, rig.arm.dof()))
-        .transpose()?;
+    let recorder = record::ticks(args.record.as_deref(), &rig)?;
     let listen = match args.listen {
         Some(addr) => addr,
         None => settings::LISTEN.parse().context("the usual address")?,
@@ -274,6 +271,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         json: args.json,
         out,
     };
+    let scribe = record::scribe(args.record.as_deref(), &rig, &log)?;
     let keeper = match args.black_box.clone() {
         Some(dir) => {
             // Better now than after the stop that it was for.
@@ -361,7 +359,8 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         .attended(Some(attendant))
         .with_external(args.clock_dispersion.map(External::host))
         .showing(rig.described())
-        .with_black_box(asker);
+        .with_black_box(asker)
+        .recorded(scribe);
     let (notices, heard) = mpsc::unbounded_channel();
     let listener = tokio::spawn(listen_to(
         heard,

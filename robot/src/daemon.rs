@@ -25,6 +25,7 @@ use crate::blackbox::Asker;
 use crate::clock::Origin;
 use crate::desk::{Desk, Progress};
 use crate::door::{self, Door, Place, Verdict};
+use crate::recording::Scribe;
 use crate::refused::{Reason, Refused, Tally};
 use crate::servo::thread::{Times, Timing};
 use crate::servo::{ArmFault, Handle, Order, Report};
@@ -82,6 +83,7 @@ pub struct Daemon {
     refused: Tally,
     silent_drains: u32,
     asker: Option<Asker>,
+    scribe: Option<Scribe>,
     fault: Option<ArmFault>,
     attendant: Option<Attendant>,
 }
@@ -187,6 +189,7 @@ impl Daemon {
             refused: Tally::default(),
             silent_drains: 0,
             asker: None,
+            scribe: None,
             fault: None,
             attendant: None,
         }
@@ -210,6 +213,13 @@ impl Daemon {
     #[must_use]
     pub fn with_black_box(mut self, asker: Option<Asker>) -> Self {
         self.asker = asker;
+        self
+    }
+
+    /// The same, recorded.
+    #[must_use]
+    pub fn recorded(mut self, scribe: Option<Scribe>) -> Self {
+        self.scribe = scribe;
         self
     }
 
@@ -457,6 +467,9 @@ impl Daemon {
             }
             if let Some(attendant) = &mut self.attendant {
                 attendant.saw(&report);
+            }
+            if let Some(scribe) = &mut self.scribe {
+                scribe.take(&report, active.as_deref().map(|active| &active.session));
             }
             let _ = notices.send(Notice::Report(Box::new(report)));
         }

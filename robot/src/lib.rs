@@ -13,6 +13,7 @@ pub mod desk;
 pub mod door;
 pub mod driver;
 pub mod program;
+pub mod recording;
 pub mod refused;
 pub mod rig;
 pub mod safety;

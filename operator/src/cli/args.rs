@@ -138,6 +138,10 @@ pub struct Args {
     /// Offer protocol versions up to this one; 2 is an experiment [default: 1].
     #[arg(long, value_name = "N")]
     pub protocol_max: Option<u16>,
+    /// Record the hand, the arm as it is told, and all that is known of the link into this new MCAP file: Foxglove,
+    /// Lichtblick and rerun open it, `telemime import` makes demonstrations of it.
+    #[arg(long, value_name = "FILE.mcap")]
+    pub record: Option<PathBuf>,
     /// Seed of learning.
     #[arg(long)]
     pub seed: Option<u64>,

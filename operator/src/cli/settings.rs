@@ -80,6 +80,7 @@ struct File {
     rest_s: Option<f64>,
     patience_s: Option<f64>,
     protocol_max: Option<u16>,
+    record: Option<PathBuf>,
     seed: Option<u64>,
     metrics: Option<SocketAddr>,
     log_format: Option<logs::Format>,
@@ -147,6 +148,7 @@ impl Settings for Args {
                 new("rest_s", "rest", Kind::Number, "1.0").or(REST_S),
                 new("patience_s", "patience", Kind::Number, "10.0").or(PATIENCE_S),
                 new("protocol_max", "protocol-max", Kind::Integer, "1").or(1),
+                new("record", "record", Kind::Text, "\"session.mcap\""),
                 new("seed", "seed", Kind::Integer, "0").or(0),
                 new("input.latency_ms", "input-latency", Kind::Number, "60.0").or(0.0),
                 new("input.glitch_gate", "glitch-gate", Kind::Switch, "true").or(false),
@@ -222,6 +224,7 @@ impl Settings for Args {
         self.rest = self.rest.or(file.rest_s);
         self.patience = self.patience.or(file.patience_s);
         self.protocol_max = self.protocol_max.or(file.protocol_max);
+        self.record = self.record.or(file.record);
         self.seed = self.seed.or(file.seed);
         self.metrics = self.metrics.or(file.metrics);
         self.log_format = self.log_format.or(file.log_format);

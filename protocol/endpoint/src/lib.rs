@@ -16,6 +16,7 @@ pub mod pairing;
 pub mod peers;
 pub mod quic;
 pub mod reception;
+pub mod recording;
 pub mod supervisor;
 pub mod tally;
 pub mod tls;
