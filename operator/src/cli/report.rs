@@ -7,7 +7,9 @@ use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use telemime_endpoint::Mono;
 use telemime_endpoint::cli::Printer;
+use telemime_endpoint::logs;
 use telemime_endpoint::meter::Counts;
+use telemime_endpoint::recording;
 use tokio::sync::mpsc;
 
 use super::played::Played;
@@ -229,6 +231,9 @@ pub enum Event {
     Console {
         url: String,
     },
+    Metrics {
+        url: String,
+    },
     LinkAsked(Shape),
     Kept {
         name: String,
@@ -242,6 +247,12 @@ pub enum Event {
     },
     Saved {
         file: PathBuf,
+    },
+    Recording {
+        file: PathBuf,
+        messages: u64,
+        dropped: u64,
+        error: Option<String>,
     },
     Done {
         completed: bool,
@@ -403,6 +414,7 @@ impl Event {
             }
             // With one performance, the line at the end says all.
             Self::Performed { .. } => return None,
+            Self::Metrics { url } => format!("metrics {url}"),
             Self::Console { url } => format!("the page is at {url}"),
             Self::LinkAsked(_) => return None,
             Self::Kept { name } => format!("kept as {name}"),
@@ -431,6 +443,12 @@ impl Event {
                     novel.join(", ")
                 )
             }
+            Self::Recording {
+                file,
+                messages,
+                dropped,
+                error,
+            } => recording::told(file, *messages, *dropped, error.as_deref()),
             Self::Saved { file } => format!("saved {}", file.display()),
             Self::Done {
                 samples,
@@ -455,6 +473,18 @@ impl Event {
     }
 }
 
+impl Event {
+    /// What became of a recording.
+    pub(super) fn recording(outcome: &recording::Outcome) -> Self {
+        Self::Recording {
+            file: outcome.path.clone(),
+            messages: outcome.messages,
+            dropped: outcome.dropped,
+            error: outcome.error.as_ref().map(ToString::to_string),
+        }
+    }
+}
+
 /// Where events go.
 #[derive(Debug, Clone)]
 pub(super) struct Log {
@@ -466,7 +496,14 @@ impl Log {
     pub(super) fn say(&self, event: &Event) {
         if self.json {
             self.out.emit(event);
-        } else if let Some(text) = event.text() {
+        }
+        if logs::is_on() {
+            let often = matches!(
+                event,
+                Event::Progress { .. } | Event::Telemetry { .. } | Event::Bent { .. }
+            );
+            logs::event(event, &event.text().unwrap_or_default(), often);
+        } else if let Some(text) = event.text().filter(|_| !self.json) {
             self.out.say(text);
         }
     }

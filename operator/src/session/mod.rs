@@ -21,6 +21,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use telemime_endpoint::reception::Reception;
+use telemime_endpoint::tally::Tally;
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::predict::Params;
 use telemime_protocol::skill::Skill;
@@ -81,6 +82,7 @@ pub struct Session {
     hand: Option<Hand>,
     gate: Gate,
     interval: Interval,
+    heard: Option<VecDeque<(Option<u32>, HandSample)>>,
     recogniser: Option<Recogniser>,
     external: Option<ExternalClock>,
     verdict: Option<Verdict>,
@@ -106,6 +108,7 @@ pub struct Session {
     urgent: bool,
     next_stop: Option<Stamp>,
     counters: Counters,
+    tally: Tally,
     /// As they were at the request that is not answered yet.
     before: Option<Counters>,
     outputs: VecDeque<Output>,
@@ -130,6 +133,7 @@ impl Session {
             hand: None,
             gate: Gate::default(),
             interval: Interval::default(),
+            heard: None,
             recogniser: None,
             external: None,
             verdict: None,
@@ -150,6 +154,7 @@ impl Session {
             urgent: false,
             next_stop: None,
             counters: Counters::default(),
+            tally: Tally::default(),
             before: None,
             outputs: VecDeque::new(),
             events: VecDeque::new(),
@@ -196,6 +201,11 @@ impl Session {
         self.engagement
     }
 
+    /// What passed, by kind.
+    pub fn tally(&self) -> &Tally {
+        &self.tally
+    }
+
     /// The counters.
     pub fn counters(&self) -> Counters {
         self.counters
@@ -232,6 +242,7 @@ impl Session {
     /// [`Session::let_go`]. Samples out of order or not finite are dropped and counted.
     pub fn handle_sample(&mut self, now: Stamp, mut sample: HandSample) {
         sample.t = sample.t.offset_by_secs(-self.config.input_latency_s);
+        self.listen(&sample);
         if matches!(
             self.activity,
             Activity::Play {
@@ -595,10 +606,7 @@ impl Session {
             }
         };
         self.counters.messages += 1;
-        self.outputs.push_back(Output::Datagram {
-            bytes: self.version.encode_operator_datagram(&datagram),
-            motion: true,
-        });
+        self.say(&datagram, true);
     }
 
     fn request(&mut self, now: Stamp, drive: Drive) {
@@ -637,13 +645,18 @@ impl Session {
     }
 
     fn control(&mut self, message: &OperatorControl) {
-        self.outputs.push_back(Output::Control(message.encode()));
+        let bytes = message.encode();
+        self.tally.operator_control(Some(message), bytes.len());
+        self.outputs.push_back(Output::Control(bytes));
     }
 
     fn datagram(&mut self, message: &OperatorDatagram) {
-        self.outputs.push_back(Output::Datagram {
-            bytes: self.version.encode_operator_datagram(message),
-            motion: false,
-        });
+        self.say(message, false);
+    }
+
+    fn say(&mut self, message: &OperatorDatagram, motion: bool) {
+        let bytes = self.version.encode_operator_datagram(message);
+        self.tally.operator_datagram(Some(message), bytes.len());
+        self.outputs.push_back(Output::Datagram { bytes, motion });
     }
 }
