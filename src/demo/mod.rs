@@ -10,7 +10,7 @@ mod processes;
 mod summary;
 
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, bail};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};

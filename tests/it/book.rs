@@ -155,7 +155,7 @@ impl Reader {
             // What builds this very program is not for it to run.
             "" if line.starts_with("cargo ") || line.starts_with("export PATH") => {}
             "robot" => {
-                let robot = self.start("robot", &format!("{there} --listen 127.0.0.1:0"));
+                let robot = self.start("robot", &format!("{there} --listen 127.0.0.1:0 --follow-stdin"));
                 let said = robot.hears("127.0.0.1:");
                 let (_, port) = said.split_once("127.0.0.1:").unwrap();
                 let port: String = port.chars().take_while(char::is_ascii_digit).collect();
