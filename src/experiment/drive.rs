@@ -64,14 +64,15 @@ pub(super) fn session(settings: &Settings, axes: Axes) -> SessionConfig {
 #[derive(Default)]
 struct Heard {
     ready: Option<Stamp>,
-    telemetry: Vec<Stamp>,
+    /// When it came, and when it was true by the robot's clock, if that was known.
+    telemetry: Vec<(Stamp, Option<Stamp>)>,
 }
 
 /// What is known when it is over.
 struct Raw {
     reports: Vec<Report>,
     passages: Vec<Passage>,
-    heard_ns: Vec<i64>,
+    heard_ns: Vec<(i64, Option<i64>)>,
     zero_ns: Option<i64>,
     up_from: std::net::SocketAddr,
     /// When the common clock showed 0.
@@ -96,8 +97,8 @@ pub(super) fn drive(
         ticks,
         packets: Vec::new(),
         outcome,
-        messages: raw.counters.messages,
-        knots: raw.counters.knots,
+        messages: raw.counters.messages - raw.counters.rest_messages,
+        knots: raw.counters.knots - raw.counters.rest_knots,
         scale,
         heard_s: Vec::new(),
         simulated_s: raw.simulated_s,
@@ -120,13 +121,11 @@ pub(super) fn drive(
         arrived_s: p.arrives.map(instant_s),
     });
     let packets = packets.collect();
-    let heard_s = raw.heard_ns.iter().map(|&ns| time_s(ns)).collect();
-    let engaged: Vec<&Report> = raw
-        .reports
-        .iter()
-        .skip_while(|r| r.engagement.number == 0)
+    let heard = raw.heard_ns.iter();
+    let heard_s = heard
+        .map(|&(at, of)| (time_s(at), of.map(time_s)))
         .collect();
-    let Some(first) = engaged.first() else {
+    let Some(engaged) = raw.reports.iter().position(|r| r.engagement.number > 0) else {
         let trace = trace(Vec::new(), Outcome::NotDriven(why), f64::NAN);
         return Ok(Trace {
             packets,
@@ -135,9 +134,12 @@ pub(super) fn drive(
         });
     };
     let follows = |r: &Report| matches!(r.state, RobotState::Engaged | RobotState::Coasting);
-    let mapping = first.mapping;
+    let mapping = raw.reports[engaged].mapping;
     let mut clamps = 0;
-    let ticks = engaged.iter().map(|r| {
+    // An arm that waits to be engaged while the recording runs errs like any other.
+    let begun = raw.reports.iter().position(|r| time_s(r.at.0) >= 0.0);
+    let from = begun.map_or(engaged, |begun| begun.min(engaged));
+    let ticks = raw.reports[from..].iter().map(|r| {
         let limited = r.clamps > std::mem::replace(&mut clamps, r.clamps);
         Tick {
             t_s: time_s(r.at.0),
@@ -145,11 +147,12 @@ pub(super) fn drive(
             turn: mapping.unorient(&r.orientation),
             jerk_m_s3: r.jerk_m_s3,
             limited,
+            follows: follows(r),
             age_s: follows(r).then_some(r.age_s),
         }
     });
     let ticks: Vec<_> = ticks.collect();
-    let stopped = engaged.iter().find(|r| !follows(r));
+    let stopped = raw.reports[engaged..].iter().find(|r| !follows(r));
     let outcome = match stopped {
         Some(r) if time_s(r.at.0) < end_s => {
             Outcome::Stopped(time_s(r.at.0), format!("{:?}", r.cause))
@@ -193,25 +196,32 @@ async fn scenario(
     } = operator;
     let heard: Rc<RefCell<Heard>> = Rc::default();
     let log = heard.clone();
+    let (latency_s, session_zero) = (settings.input_latency_s, pair.to_mono(Stamp::ZERO));
+    // When the recording's time is 0, known from when the robot is ready.
+    let zero =
+        move |ready: Stamp| Mono(ready.0 + session_zero.0).offset_by_secs(REST_S - latency_s);
+    let network = pair.network.clone();
     let listening = tokio::task::spawn_local(async move {
         while let Some(notice) = notices.recv().await {
             let mut heard = log.borrow_mut();
             match notice {
                 Notice::Event(at, Event::Ready) => {
-                    heard.ready.get_or_insert(at);
+                    if heard.ready.is_none() {
+                        heard.ready = Some(at);
+                        network.begin(clock.instant(zero(at)));
+                    }
                 }
-                Notice::Event(at, Event::Telemetry(_)) => heard.telemetry.push(at),
+                Notice::Event(at, Event::Telemetry(told)) => {
+                    let of = (told.t_us != 0).then(|| Stamp(told.t_us.saturating_mul(1000)));
+                    heard.telemetry.push((at, of));
+                }
                 _ => {}
             }
         }
     });
     let cut = settings.outage_s.map(|(from_s, to_s)| {
         let (network, heard) = (pair.network.clone(), heard.clone());
-        let (latency_s, session_zero) = (settings.input_latency_s, pair.to_mono(Stamp::ZERO));
-        let zero = move || {
-            let ready = heard.borrow().ready?;
-            Some(Mono(ready.0 + session_zero.0).offset_by_secs(REST_S - latency_s))
-        };
+        let zero = move || heard.borrow().ready.map(zero);
         async move {
             let mut tick = tokio::time::interval(std::time::Duration::from_millis(1));
             for (at_s, down) in [(from_s, true), (to_s, false)] {
@@ -232,7 +242,9 @@ async fn scenario(
     }
     listening.abort();
     let heard = heard.borrow();
-    let heard_ns = heard.telemetry.iter().map(|at| pair.to_mono(*at).0);
+    let mono_ns = |at: Stamp| pair.to_mono(at).0;
+    let heard_ns = heard.telemetry.iter();
+    let heard_ns = heard_ns.map(|&(at, of)| (mono_ns(at), of.map(mono_ns)));
     Ok(Raw {
         reports: pair.robot.reports().clone(),
         passages: pair.network.logged(),
