@@ -160,12 +160,12 @@ pub(super) fn drive(
         });
     Trace {
         ticks: ticks.collect(),
-        packets: path.packets,
+        packets: Some(path.packets),
         outcome: Outcome::Followed,
         messages,
         knots,
         scale: mapping.scale,
-        heard_s: Vec::new(),
+        heard_s: None,
         simulated_s: end_s + REST_S,
     }
 }

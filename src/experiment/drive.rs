@@ -20,7 +20,7 @@ use super::trace::{Outcome, Packet, Tick, Trace};
 use crate::ground::{Operator, Pair, PairError, Passage, run_virtual};
 
 /// The hand rests this long before a recording begins, s: enough for an engage over any link of the plans.
-const REST_S: f64 = 3.0;
+pub(super) const REST_S: f64 = 3.0;
 
 /// The other way's chances.
 const DOWN_STREAM: u64 = 0x9e37_79b9_7f4a_7c15;
@@ -95,12 +95,12 @@ pub(super) fn drive(
     let raw = run_virtual(scenario(settings, subject, rig, axes, seed, samples))??;
     let trace = |ticks, outcome, scale| Trace {
         ticks,
-        packets: Vec::new(),
+        packets: None,
         outcome,
         messages: raw.counters.messages - raw.counters.rest_messages,
         knots: raw.counters.knots - raw.counters.rest_knots,
         scale,
-        heard_s: Vec::new(),
+        heard_s: None,
         simulated_s: raw.simulated_s,
     };
     let why = match &raw.outcome {
@@ -120,11 +120,10 @@ pub(super) fn drive(
         bytes: p.len_bytes,
         arrived_s: p.arrives.map(instant_s),
     });
-    let packets = packets.collect();
+    let packets = Some(packets.collect());
     let heard = raw.heard_ns.iter();
-    let heard_s = heard
-        .map(|&(at, of)| (time_s(at), of.map(time_s)))
-        .collect();
+    let heard_s = heard.map(|&(at, of)| (time_s(at), of.map(time_s)));
+    let heard_s = Some(heard_s.collect());
     let Some(engaged) = raw.reports.iter().position(|r| r.engagement.number > 0) else {
         let trace = trace(Vec::new(), Outcome::NotDriven(why), f64::NAN);
         return Ok(Trace {

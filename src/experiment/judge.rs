@@ -141,8 +141,13 @@ pub(super) fn judge(
 
 /// While the recording lasts.
 fn wire(figures: &mut Figures, trace: &Trace, end_s: f64) {
+    figures.messages_per_s = Some(f64::from(trace.messages) / end_s);
+    figures.knots_per_s = Some(f64::from(trace.knots) / end_s);
+    let Some(packets) = &trace.packets else {
+        return;
+    };
     let during = |up: bool| {
-        let of = trace.packets.iter().filter(move |p| p.up == up);
+        let of = packets.iter().filter(move |p| p.up == up);
         of.filter(|p| (0.0..end_s).contains(&p.sent_s))
     };
     let rates = |up: bool| {
@@ -151,8 +156,6 @@ fn wire(figures: &mut Figures, trace: &Trace, end_s: f64) {
     };
     (figures.up_packets_per_s, figures.up_bytes_per_s) = rates(true);
     (figures.down_packets_per_s, figures.down_bytes_per_s) = rates(false);
-    figures.messages_per_s = Some(f64::from(trace.messages) / end_s);
-    figures.knots_per_s = Some(f64::from(trace.knots) / end_s);
     if let Some(passing) = Passing::of(during(true).map(|p| (p.sent_s, p.arrived_s))) {
         figures.delay_p50_s = Some(passing.delay_p50_s);
         figures.delay_p99_s = Some(passing.delay_p99_s);
@@ -236,7 +239,7 @@ fn outage(figures: &mut Figures, trace: &Trace, (from_s, to_s): (f64, f64), end_
     let anew = |&&(at_s, of_s): &&(f64, Option<f64>)| {
         at_s >= to_s && of_s.is_none_or(|of_s| of_s > middle_s)
     };
-    let heard = trace.heard_s.iter().find(anew);
+    let heard = trace.heard_s.iter().flatten().find(anew);
     figures.reconnect_s = heard.map(|(at_s, _)| at_s - to_s);
     if let Outcome::Stopped(at_s, _) = trace.outcome
         && (from_s..to_s + AFTER_S).contains(&at_s)
@@ -280,18 +283,18 @@ mod tests {
         };
         Trace {
             ticks: (0..5000).map(tick).collect(),
-            packets: Vec::new(),
+            packets: Some(Vec::new()),
             outcome,
             messages: 10,
             knots: 20,
             scale: 0.1,
             // The third was sent before the link was cut.
-            heard_s: vec![
+            heard_s: Some(vec![
                 (0.5, Some(0.45)),
                 (1.9, Some(1.85)),
                 (3.05, Some(1.95)),
                 (3.25, None),
-            ],
+            ]),
             simulated_s: 5.0,
         }
     }
@@ -342,9 +345,8 @@ mod tests {
             bytes: 100,
             arrived_s: Some(sent_s + 0.1),
         };
-        run.packets = (-10..20)
-            .map(|i| packet(f64::from(i) * 0.5, i % 2 == 0))
-            .collect();
+        let packets = (-10..20).map(|i| packet(f64::from(i) * 0.5, i % 2 == 0));
+        run.packets = Some(packets.collect());
         let mut figures = Figures::default();
         wire(&mut figures, &run, 5.0);
         assert_eq!(figures.up_packets_per_s, Some(1.0));

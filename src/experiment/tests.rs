@@ -26,6 +26,9 @@ fn args(plan: &Path, out: &Path, shard: &str, threads: u16) -> Args {
         out: Some(out.to_owned()),
         shard: shard.parse().unwrap(),
         threads: Some(threads),
+        ground: Ground::Virtual,
+        seeds: None,
+        people: None,
         dry_run: false,
         list: false,
         print: None,
@@ -203,8 +206,8 @@ fn whoever_follows_meets_the_same_link_at_the_same_moment_of_the_hand() {
         } else {
             baseline::drive(settings, &subjects[0], rig, axes, 7)
         };
-        let during: Vec<_> = trace
-            .packets
+        let packets = trace.packets.unwrap();
+        let during: Vec<_> = packets
             .iter()
             .filter(|p| (0.0..9.0).contains(&p.sent_s))
             .collect();

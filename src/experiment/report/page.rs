@@ -6,6 +6,7 @@ use super::charts::Chart;
 use super::group::{Group, Interval};
 use super::view::{View, called, delay_s, value};
 use crate::experiment::factor::{FACTORS, UNUSED};
+use crate::experiment::real::Ground;
 use crate::experiment::store::Manifest;
 use crate::figure::FigureError;
 
@@ -80,8 +81,23 @@ fn summary(view: &View<'_>, manifest: &Manifest) -> String {
     } else {
         "recorded hands"
     };
+    let ground = match manifest.ground {
+        Ground::Virtual => {
+            "Every run is both daemons’ own sessions, predictor, servo and arm over real QUIC on a virtual clock, or a baseline through the same link and the same arm."
+        }
+        Ground::Loopback => {
+            "Telemime’s runs are both daemons as processes, in real time, with a relay that shapes what passes between their sockets; baselines and floor are computed, over the same link model and through the same arm."
+        }
+        Ground::Netns => {
+            "Telemime’s runs are both daemons as processes, in real time, in two network namespaces with the kernel’s netem between them; baselines and floor are computed, over our model of the same link and through the same arm."
+        }
+    };
+    let thinned = match manifest.thinned.as_str() {
+        "" => String::new(),
+        flags => format!(" A part of the plan: <code>{}</code>.", escape(flags)),
+    };
     format!(
-        "<p class=\"lead\">{} of {}, {driven}, {} of the link’s chances. Every run is both daemons’ own sessions, predictor, servo and arm over real QUIC on a virtual clock, or a baseline through the same link and the same arm.</p>\n",
+        "<p class=\"lead\">{} of {}, {driven}, {} of the link’s chances. {ground}{thinned}</p>\n",
         plural(manifest.runs, "run", "runs"),
         plural(people(view), "person", "people"),
         plural(seeds(view).max(1), "seed", "seeds"),
@@ -291,9 +307,22 @@ fn notes(view: &View<'_>) -> String {
 }
 
 fn repeat(manifest: &Manifest, plan: &str) -> String {
+    let mut flags = String::new();
+    if !manifest.thinned.is_empty() {
+        flags = format!(" {}", manifest.thinned);
+    }
+    let again = match manifest.ground {
+        Ground::Virtual => {
+            "The same plan gives the same bytes, with any number of threads or shards."
+        }
+        ground @ (Ground::Loopback | Ground::Netns) => {
+            flags += &format!(" --ground {ground}");
+            "In real time no two runs are quite the same: what the scheduler does is in the last digits. The plan, the link’s chances and all that is computed are."
+        }
+    };
     let mut out = format!(
-        "<section>\n<h2>To repeat it</h2>\n<pre>telemime experiment {plan} -o DIR\ntelemime report DIR</pre>\n\
-         <p>The same plan gives the same bytes, with any number of threads or shards. Version {}, seed {}, {} on {}; SHA-256 of the plan <code>{}</code>.</p>\n",
+        "<section>\n<h2>To repeat it</h2>\n<pre>telemime experiment {plan}{flags} -o DIR\ntelemime report DIR</pre>\n\
+         <p>{again} Version {}, seed {}, {} on {}; SHA-256 of the plan <code>{}</code>.</p>\n",
         escape(&manifest.version),
         manifest.seed,
         escape(&manifest.host.os),
