@@ -5,9 +5,9 @@ use std::rc::Rc;
 
 use telemime_endpoint::Mono;
 use telemime_operator::cli::Axes;
-use telemime_operator::daemon::Notice;
+use telemime_operator::daemon::{DaemonError, Notice};
 use telemime_operator::demonstration::{Demonstration, Sample};
-use telemime_operator::session::{Event, SessionConfig};
+use telemime_operator::session::{Counters, Event, SessionConfig};
 use telemime_operator::task::{self, Recording, Task};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::RobotState;
@@ -21,6 +21,9 @@ use crate::ground::{Operator, Pair, PairError, Passage, run_virtual};
 
 /// The hand rests this long before a recording begins, s: enough for an engage over any link of the plans.
 pub(super) const REST_S: f64 = 3.0;
+
+/// Why nothing was driven over a link that not even the handshake gets through.
+pub(super) const UNREACHED: &str = "the robot was not reached";
 
 /// The other way's chances.
 const DOWN_STREAM: u64 = 0x9e37_79b9_7f4a_7c15;
@@ -77,7 +80,7 @@ struct Raw {
     up_from: std::net::SocketAddr,
     /// When the common clock showed 0.
     origin: tokio::time::Instant,
-    counters: telemime_operator::session::Counters,
+    counters: Counters,
     outcome: task::Outcome,
     simulated_s: f64,
 }
@@ -204,11 +207,9 @@ async fn scenario(
         while let Some(notice) = notices.recv().await {
             let mut heard = log.borrow_mut();
             match notice {
-                Notice::Event(at, Event::Ready) => {
-                    if heard.ready.is_none() {
-                        heard.ready = Some(at);
-                        network.begin(clock.instant(zero(at)));
-                    }
+                Notice::Event(at, Event::Ready) if heard.ready.is_none() => {
+                    heard.ready = Some(at);
+                    network.begin(clock.instant(zero(at)));
                 }
                 Notice::Event(at, Event::Telemetry(told)) => {
                     let of = (told.t_us != 0).then(|| Stamp(told.t_us.saturating_mul(1000)));
@@ -235,7 +236,14 @@ async fn scenario(
     let (summary, task) = (&mut done)
         .await
         .expect("the operator's task does not panic");
-    let summary = summary?;
+    let (counters, outcome) = match summary {
+        Ok(summary) => (summary.counters, summary.outcome),
+        Err(DaemonError::Unreachable { .. }) => {
+            let outcome = task::Outcome::Interrupted(UNREACHED.to_owned());
+            (Counters::default(), outcome)
+        }
+        Err(e) => return Err(e.into()),
+    };
     if let Some(cutting) = cutting {
         cutting.abort();
     }
@@ -251,8 +259,8 @@ async fn scenario(
         zero_ns: task.zero().map(|zero| pair.to_mono(zero).0),
         up_from: own,
         origin,
-        counters: summary.counters,
-        outcome: summary.outcome,
+        counters,
+        outcome,
         simulated_s: began.elapsed().as_secs_f64(),
     })
 }

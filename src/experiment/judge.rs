@@ -68,6 +68,9 @@ pub(super) fn judge(
         scale: Some(trace.scale).filter(|s| s.is_finite()),
         ..Figures::default()
     };
+    if let Outcome::NotDriven(_) = trace.outcome {
+        figures.followed = Some(0.0);
+    }
     wire(&mut figures, trace, end_s);
     prediction(&mut figures, settings, subject, d, axes);
     if let Some(outage_s) = settings.outage_s {

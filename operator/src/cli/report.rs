@@ -260,7 +260,7 @@ pub enum Event {
         packets_on_wire: u64,
         bytes_session_up: u64,
         bytes_session_down: u64,
-        link: session::Seen,
+        link: Box<session::Seen>,
     },
 }
 
@@ -291,7 +291,7 @@ impl Event {
             packets_on_wire: motion.packets,
             bytes_session_up: sent.bytes - motion.bytes,
             bytes_session_down: received.bytes,
-            link: summary.seen,
+            link: Box::new(summary.seen),
         }
     }
 

@@ -18,14 +18,12 @@ use super::super::drive::{REST_S, driven};
 use super::super::factor::Settings;
 use super::super::subject::Subject;
 use super::netns::Namespaces;
+use crate::ground::PATIENCE;
 use crate::process::{Process, flag, listening, text, watch_robot};
 use crate::relay::{Passage, Relay, RelayConfig};
 
 /// Longer than its recording and this a run does not take, s: reaching the robot, the model, the rest, the end.
 const MOST_BESIDE_S: f64 = 120.0;
-
-/// The operator gives up when it has not reached the robot within this time, s.
-const PATIENCE_S: f64 = 30.0;
 
 /// What is driven, and how.
 pub(super) struct Driven<'a> {
@@ -167,7 +165,7 @@ impl Driven<'_> {
             ("--skill", text(&skill)),
             ("--replay", text(&recording)),
             ("--rest", REST_S.to_string()),
-            ("--patience", PATIENCE_S.to_string()),
+            ("--patience", PATIENCE.as_secs_f64().to_string()),
             ("--axes", format!("{:?}", self.axes).to_lowercase()),
             ("--future-bound", bound),
             ("--max-silence", settings.silence_s.to_string()),
@@ -237,10 +235,8 @@ impl Driven<'_> {
         watched?;
         left?;
         stopped?;
-        if !operator_events
-            .iter()
-            .any(|e| matches!(e, Operator::Done { .. }))
-        {
+        let told = |e: &Operator| matches!(e, Operator::Done { .. } | Operator::Dialling { .. });
+        if !operator_events.iter().any(told) {
             bail!("the operator ended without a result; it says why above");
         }
         Ok(Left {

@@ -1,5 +1,6 @@
 //! The report as one page: nothing is fetched, light and dark, wide and narrow.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use super::charts::Chart;
@@ -292,14 +293,20 @@ fn notes(view: &View<'_>) -> String {
     if view.groups.iter().any(|g| g.text("motion") == "off-model") {
         notes.push("Motion never demonstrated: of generated hands, a wave turned into a chop, by somebody else; of recordings, another gesture of the same person where there is one.".to_owned());
     }
-    let undriven = view.groups.iter().flat_map(|g| &g.rows);
-    let undriven = undriven
-        .filter(|r| r.outcome.starts_with("not driven"))
-        .count();
-    if undriven > 0 {
+    let mut undriven: BTreeMap<(&str, &str), usize> = BTreeMap::new();
+    for group in &view.groups {
+        for row in &group.rows {
+            if let Some(why) = row.outcome.strip_prefix("not driven: ") {
+                *undriven.entry((group.text("up"), why)).or_default() += 1;
+            }
+        }
+    }
+    for ((link, why), n) in undriven {
         notes.push(format!(
-            "In {} the arm never engaged; their errors are blank, not zero.",
-            plural(undriven, "run", "runs")
+            "Over <code>{}</code> the arm never engaged in {}: {}. Their errors are blank, not zero.",
+            escape(link),
+            plural(n, "run", "runs"),
+            escape(why)
         ));
     }
     let items: String = notes.iter().map(|n| format!("<li>{n}</li>\n")).collect();
