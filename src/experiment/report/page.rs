@@ -107,8 +107,7 @@ fn summary(view: &View<'_>, manifest: &Manifest) -> String {
 
 /// The few figures one looks for first.
 fn tiles(view: &View<'_>) -> String {
-    let delay = view.shown_delay_s();
-    let first = |motion, method| view.at(motion, method, delay, &[]).next();
+    let first = |motion, method| view.shown(motion, method).next();
     let Some(ours) = first("on-model", "ours").or_else(|| first("off-model", "ours")) else {
         return String::new();
     };
