@@ -153,6 +153,7 @@ fn the_same_plan_gives_the_same_bytes_on_any_number_of_threads_in_parts_and_inte
         assert!(!names.contains(fetched), "{fetched}");
     }
     assert!(html.contains("<h1>A &amp; B</h1>") && !html.contains("NaN"));
+    assert!(html.contains("<h2>Outages</h2>") && html.contains("<td>1 of 1 run</td>"));
     for chart in [
         "delay-on-model",
         "delay-off-model",

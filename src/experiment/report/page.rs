@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 
 use super::charts::Chart;
 use super::group::{Group, Interval};
+use super::outages::outages;
 use super::view::{View, called, delay_s, value};
 use crate::experiment::factor::{FACTORS, UNUSED};
 use crate::experiment::real::Ground;
@@ -47,6 +48,7 @@ pub(super) fn page(
         );
     }
     out += "</section>\n";
+    out += &outages(view);
     out += &tables(view);
     out += &notes(view);
     out += &repeat(manifest, plan);
@@ -72,7 +74,7 @@ fn seeds(view: &View<'_>) -> usize {
     all.len()
 }
 
-fn plural(n: usize, one: &str, many: &str) -> String {
+pub(super) fn plural(n: usize, one: &str, many: &str) -> String {
     format!("{n} {}", if n == 1 { one } else { many })
 }
 
@@ -164,7 +166,7 @@ fn texts(i: Interval, unit: f64, decimals: usize) -> (String, Option<String>) {
 }
 
 /// The same in a table.
-fn scaled(i: Interval, unit: f64, decimals: usize) -> String {
+pub(super) fn scaled(i: Interval, unit: f64, decimals: usize) -> String {
     match texts(i, unit, decimals) {
         (mean, None) => mean,
         (mean, Some(span)) => format!("{mean} <i>{span}</i>"),
@@ -355,7 +357,7 @@ fn repeat(manifest: &Manifest, plan: &str) -> String {
     out
 }
 
-fn escape(text: &str) -> String {
+pub(super) fn escape(text: &str) -> String {
     text.replace('&', "&amp;")
         .replace('<', "&lt;")
         .replace('>', "&gt;")
