@@ -85,7 +85,7 @@ fn course_over(
 }
 
 fn by_delay(view: &View<'_>, (motion, words): (&str, &str)) -> Option<Chart> {
-    if view.delays().len() < 2 {
+    if view.delays().len() < 2 || !view.differ_by_delay() {
         return None;
     }
     let ms = |g: &Group<'_>| delay_s(g).map(|s| s * 1e3);

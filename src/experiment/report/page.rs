@@ -295,12 +295,23 @@ fn notes(view: &View<'_>) -> String {
         notes.push("Motion never demonstrated: of generated hands, a wave turned into a chop, by somebody else; of recordings, another gesture of the same person where there is one.".to_owned());
     }
     let mut undriven: BTreeMap<(&str, &str), usize> = BTreeMap::new();
+    let mut stopped: BTreeMap<&str, usize> = BTreeMap::new();
     for group in &view.groups {
         for row in &group.rows {
             if let Some(why) = row.outcome.strip_prefix("not driven: ") {
                 *undriven.entry((group.text("up"), why)).or_default() += 1;
             }
+            if row.outcome.starts_with("stopped") && group.text("outage") == "none" {
+                *stopped.entry(group.text("up")).or_default() += 1;
+            }
         }
+    }
+    for (link, n) in stopped {
+        notes.push(format!(
+            "Over <code>{}</code> Telemime’s arm stopped by itself in {}, before or while the hand moved, and stayed where it was; that is in the means.",
+            escape(link),
+            plural(n, "run", "runs")
+        ));
     }
     for ((link, why), n) in undriven {
         notes.push(format!(

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use nalgebra::Vector3;
+use telemime_sim::link::LinkConfig;
 
 use super::group::{Group, Others, groups, varying};
 use crate::experiment::factor::{FACTORS, UNUSED, link};
@@ -74,10 +75,35 @@ impl<'a> View<'a> {
         all
     }
 
-    /// Delays of plain groups' links, s, ascending.
+    /// Plain groups of ours, or of everybody where there is none.
+    fn leading(&self) -> Vec<&Group<'a>> {
+        let plain = || self.groups.iter().filter(|g| self.plain(g, &[]));
+        let ours: Vec<_> = plain().filter(|g| g.text("method") == "ours").collect();
+        if ours.is_empty() {
+            plain().collect()
+        } else {
+            ours
+        }
+    }
+
+    /// Whether links differ in delay, jitter and loss only: then an error may be drawn over the delay.
+    pub(super) fn differ_by_delay(&self) -> bool {
+        let rest = |g: &Group<'_>| {
+            let link = link(g.text("up"), Path::new(".")).ok()?;
+            Some(LinkConfig {
+                delay_s: 0.0,
+                jitter_s: 0.0,
+                loss: LinkConfig::default().loss,
+                ..link
+            })
+        };
+        let all: Vec<_> = self.leading().into_iter().filter_map(rest).collect();
+        all.windows(2).all(|w| w[0] == w[1])
+    }
+
+    /// Delays of those groups' links, s, ascending.
     pub(super) fn delays(&self) -> Vec<f64> {
-        let plain = self.groups.iter().filter(|g| self.plain(g, &[]));
-        let mut all: Vec<f64> = plain.filter_map(delay_s).collect();
+        let mut all: Vec<f64> = self.leading().into_iter().filter_map(delay_s).collect();
         all.sort_by(f64::total_cmp);
         all.dedup();
         all
