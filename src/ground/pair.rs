@@ -534,6 +534,7 @@ impl Pair {
             config,
             learning: self.learning.clone(),
             patience: PATIENCE,
+            shown: None,
         };
         let (quit, quit_rx) = watch::channel(false);
         let (words, words_rx) = mpsc::unbounded_channel();
