@@ -18,6 +18,9 @@ const GRACE: Duration = Duration::from_secs(5);
 /// A robot gets this long until it listens: an arm's start posture may have to be searched.
 const START: Duration = Duration::from_secs(60);
 
+/// What the daemons' settings in the environment begin with.
+const PREFIXES: [&str; 2] = ["TELEMIME_ROBOT_", "TELEMIME_OPERATOR_"];
+
 /// A daemon that runs.
 pub(crate) struct Process {
     name: &'static str,
@@ -46,6 +49,14 @@ impl Process {
                 command
             }
         };
+        // What it is told here is all it is told.
+        let settings = std::env::vars_os().map(|(name, _)| name).filter(|name| {
+            let name = name.to_string_lossy();
+            PREFIXES.iter().any(|prefix| name.starts_with(prefix))
+        });
+        settings.for_each(|name| {
+            command.env_remove(name);
+        });
         let mut child = command
             .arg(name)
             .args(args)
