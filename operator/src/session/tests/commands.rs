@@ -76,7 +76,7 @@ fn every_refusal_but_a_divergence_ends_the_attempt() {
         bench.session.engage(bench.now);
         bench.drain();
         assert!(
-            matches!(bench.control.last(), Some(OperatorControl::Engage(e)) if e.engagement == 2),
+            matches!(&bench.control[..], [.., OperatorControl::Engage(e)] if e.engagement == 2),
             "and the next has a number of its own"
         );
     }
@@ -116,11 +116,11 @@ fn what_a_declined_request_took_is_not_counted() {
         tip_q: WireRotation::default(),
     });
     bench.hears(&refused(Refusal::NotYours));
-    // What the robot follows is let go, and the path ends.
-    let Counters { knots, .. } = bench.session.counters();
-    assert!((counters.knots..=counters.knots + 1).contains(&knots));
-    let expected = Counters { knots, ..counters };
-    assert_eq!(bench.session.counters(), expected, "that was no request");
+    // What was driven is let go, and its path told to the end; nothing of it is taken back.
+    let knots = bench.session.counters().knots;
+    let kept = Counters { knots, ..counters };
+    assert_eq!(bench.session.counters(), kept, "that was no request");
+    assert!(knots >= counters.knots);
 }
 
 #[test]
@@ -223,14 +223,6 @@ fn a_plan_is_engaged_once_stored_and_kept_going() {
         (1, &Drive::Play { plan: 1 }, 650)
     );
     let begun = bench.now;
-    bench.hears(&RobotControl::Engaged {
-        engagement: 1,
-        t_us: 0,
-        hand_m: [0.0; 3],
-        tip_m: [0.0; 3],
-        hand_q: None,
-        tip_q: WireRotation::default(),
-    });
     bench.idle(1000);
     let expected: Vec<_> = (1..=10)
         .map(|i| OperatorDatagram::Go {
@@ -243,6 +235,14 @@ fn a_plan_is_engaged_once_stored_and_kept_going() {
         })
         .collect();
     assert_eq!(bench.datagrams, expected);
+    bench.hears(&RobotControl::Engaged {
+        engagement: 1,
+        t_us: 0,
+        hand_m: [0.0; 3],
+        tip_m: [0.0; 3],
+        hand_q: None,
+        tip_q: WireRotation::default(),
+    });
     bench.hears(&state(RobotState::Ready, Cause::PlanFinished));
     bench.forget();
     bench.idle(1000);
