@@ -105,6 +105,8 @@ fn what_a_declined_request_took_is_not_counted() {
     }
     let counters = bench.session.counters();
     assert_eq!((counters.rest_samples, counters.samples), (7, 3));
+    assert!(0 < counters.rest_messages && counters.rest_messages < counters.messages);
+    assert!(0 < counters.rest_knots && counters.rest_knots <= counters.knots);
     bench.hears(&RobotControl::Engaged {
         engagement: 3,
         t_us: 0,
