@@ -8,7 +8,11 @@ mod adapting;
 mod alignment;
 mod arms;
 mod blackbox;
+<<<<<<< HEAD
 mod book;
+=======
+mod cluster;
+>>>>>>> main
 mod codec;
 mod commands;
 mod config;
@@ -19,6 +23,7 @@ mod evaluate;
 mod floods;
 mod frames;
 mod gate;
+mod grounds;
 mod horizon;
 mod ingest;
 mod interop;
