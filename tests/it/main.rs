@@ -8,11 +8,8 @@ mod adapting;
 mod alignment;
 mod arms;
 mod blackbox;
-<<<<<<< HEAD
 mod book;
-=======
 mod cluster;
->>>>>>> main
 mod codec;
 mod commands;
 mod config;
