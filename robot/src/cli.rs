@@ -21,13 +21,13 @@ use telemime_sim::link::parse_duration_s;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
-use crate::blackbox::{Header, Keeper, Recorder, SPAN_S, Saved, taps};
+use crate::blackbox::{Header, Keeper, Recorder, SPAN_S, taps};
 use crate::clock::Origin;
 use crate::control::ControlConfig;
 use crate::daemon::{Daemon, Failure, Notice};
 use crate::desk::Desk;
-use crate::driver::PATIENCE_S;
 use crate::driver::bridge::{Bridge, Words};
+use crate::driver::{DriverConfig, PATIENCE_S};
 use crate::refused::Refused;
 use crate::rig::{Rig, RigOptions};
 use crate::servo::thread::Servo;
@@ -235,10 +235,10 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         .driver_patience
         .or(file.driver_patience_s)
         .unwrap_or(PATIENCE_S);
-    anyhow::ensure!(
-        (0.01..=10.0).contains(&patience_s),
-        "--driver-patience {patience_s} s: from 10ms to 10s"
-    );
+    let rate_hz = bridge
+        .as_ref()
+        .map_or(1000.0, |bridge| bridge.hello.rate_hz);
+    let driving = DriverConfig::new(rate_hz, patience_s)?;
     let priority = args.realtime.or(file.realtime);
     let priority = priority.map(Priority::new).transpose()?;
     let start = match &bridge {
@@ -310,7 +310,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let (rings, handle) = servo::rings();
     let mut station = match &mut bridge {
         Some(bridge) => {
-            let arm = bridge.arm(rig.arm.clone(), patience_s)?;
+            let arm = bridge.arm(rig.arm.clone(), driving)?;
             rig.servo_before(Box::new(arm), bridge.state.opening, rings)
         }
         None => rig.servo(rings),
@@ -330,7 +330,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
             station = station.recorded(tap);
             let recorder = Recorder::new(Header::new(&rig, driver.clone()), feed, SPAN_S);
             let log = log.clone();
-            let say = move |due, saved: Saved| log.black_box(due, &saved);
+            let say = move |news| log.black_box(&news);
             Some(Keeper::start(recorder, &dir, say).context("no thread for the black box")?)
         }
         None => None,
