@@ -107,20 +107,20 @@ pub struct Args {
     /// Speak protocol versions up to this one; 2 is an experiment [default: 1].
     #[arg(long, value_name = "N")]
     pub protocol_max: Option<u16>,
-    /// Write every tick to this CSV file.
+    /// Write every tick to this CSV file, or to one with a number where it is there already.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
     /// Drive a real arm: this command (run by sh) tells its joints' state and takes setpoints, a JSON line each; docs/driver.md.
     #[arg(long, value_name = "COMMAND", conflicts_with = "start")]
     pub driver: Option<String>,
-    /// The driver may be silent, or behind its setpoints, for this long before the arm is stopped [default: 100ms].
+    /// The driver may be silent, or behind its setpoints, for this long before the arm is stopped: 10ms to 2s, and three of its periods [default: 100ms].
     #[arg(long, value_name = "TIME", value_parser = parse_duration_s)]
     pub driver_patience: Option<f64>,
     /// Run the servo at this real-time priority, 1 to 99 [50 if nothing is said], and lock memory, where the system allows it.
     #[arg(long, value_name = "PRIO", num_args = 0..=1, default_missing_value = "50")]
     pub realtime: Option<u8>,
-    /// Keep the last two minutes of all that the servo is told and decides, and write them to this folder at every stop or
-    /// fault, on `blackbox` or on SIGUSR2; `telemime replay` reads them.
+    /// Keep the last two minutes of all that the servo is told and decides, and write them to this folder at stops and
+    /// faults, on `blackbox` or on SIGUSR2; `telemime replay` reads them.
     #[arg(long, value_name = "DIR")]
     pub black_box: Option<PathBuf>,
     /// Print events as JSON lines on stdout.
