@@ -238,7 +238,7 @@ impl Daemon {
                     Word::Stop => self.servo.brake.stop_here(),
                     Word::Reset => {
                         let reset = Order::Reset { operator: active.is_some(), stop: None };
-                        if self.order(reset).is_err() {
+                        if self.order(reset).is_some() {
                             eprintln!("note: the servo was too busy to hear of the reset: type it again");
                         }
                     }
@@ -421,14 +421,12 @@ impl Daemon {
         None
     }
 
-    /// Hands an order on, or back.
-    fn order(&mut self, order: Order) -> Result<(), Order> {
+    /// Hands an order on; it comes back if there is no place for it.
+    fn order(&mut self, order: Order) -> Option<Order> {
         // 64 orders are more than a second's worth. What does not fit is not forgotten but a reason to stop.
-        self.servo.orders.push(order).map_err(|e| {
-            self.servo.brake.pull(Cause::Fault);
-            let rtrb::PushError::Full(order) = e;
-            order
-        })
+        let rtrb::PushError::Full(order) = self.servo.orders.push(order).err()?;
+        self.servo.brake.pull(Cause::Fault);
+        Some(order)
     }
 
     /// Takes the servo's reports; says whether the newest is of an arm stopped and at rest.
@@ -474,7 +472,7 @@ impl Daemon {
                 // Too large or unsupported cannot happen (1100 B); a lost connection shows up in `receive`.
                 Output::Datagram(bytes) => drop(active.connection.send_datagram(bytes.into())),
                 Output::Order(order) => {
-                    if let Err(order) = self.order(order) {
+                    if let Some(order) = self.order(order) {
                         active.session.handle_lost(&order);
                     }
                 }
