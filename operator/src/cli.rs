@@ -26,6 +26,7 @@ use crate::console::{self, Known, Live};
 use crate::daemon::{Daemon, Learning, Reopen};
 use crate::demonstration::{Demonstration, Sample};
 use crate::placed::Motion;
+use crate::recording::Scribe;
 use crate::session::Leeway;
 use crate::task::{Outcome, Recording, Task};
 pub use args::{Args, Axes};
@@ -86,7 +87,15 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     let trust = Trust::new([]);
     source.read(&trust)?;
     let skills = Skills::gather(&args, &log)?;
-    let (mut task, played) = make_task(&args, &skills, config.rotation, &log)?;
+    let (task, played) = make_task(&args, &skills, config.rotation, &log)?;
+    let scribe = args.record.as_deref().map(|path| {
+        let say = {
+            let log = log.clone();
+            move |outcome| log.say(&Event::recording(&outcome))
+        };
+        Scribe::start(path, config.rotation, say)
+    });
+    let mut task = task.recorded(scribe.transpose()?);
 
     let (quit, words) = cli::listen(args.follow_stdin, cli::OPERATOR_WORDS, || {})?;
     let meter = Meter::default();
@@ -141,6 +150,8 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         log.say(&scores);
     }
     log.say(&Event::done(&summary, &task, epoch, config.input_latency_s));
+    // Its recording says what became of it.
+    drop(task);
     drop(log);
     printing.finish();
     match summary.outcome {

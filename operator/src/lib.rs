@@ -11,6 +11,7 @@ pub mod learn;
 pub mod lessons;
 pub mod placed;
 pub mod recognise;
+pub mod recording;
 pub mod session;
 pub mod skill_file;
 pub mod tap;

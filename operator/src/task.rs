@@ -8,6 +8,7 @@ use telemime_protocol::wire::v1::{Cause, Refusal, RobotState};
 
 use crate::console::Live;
 use crate::demonstration::Sample;
+use crate::recording::Scribe;
 use crate::session::{Event, HandSample, LOST_S, Leeway, Session};
 
 /// Pause before a declined request is made again, s.
@@ -107,6 +108,7 @@ pub struct Task {
     begun: Option<Stamp>,
     requests: u32,
     trouble: Option<String>,
+    scribe: Option<Scribe>,
 }
 
 impl Task {
@@ -148,6 +150,13 @@ impl Task {
         Self::new(Work::Live(Box::new(live)))
     }
 
+    /// The same, recorded.
+    #[must_use]
+    pub fn recorded(mut self, scribe: Option<Scribe>) -> Self {
+        self.scribe = scribe;
+        self
+    }
+
     /// The person at the page, if that is the task.
     pub fn person(&mut self) -> Option<&mut Live> {
         match &mut self.work {
@@ -166,6 +175,7 @@ impl Task {
             begun: None,
             requests: 0,
             trouble: None,
+            scribe: None,
         }
     }
 
@@ -222,6 +232,9 @@ impl Task {
 
     /// The connection was lost: the arm holds, and nothing here engages it again.
     pub fn on_lost(&mut self, why: &str) {
+        if let Some(scribe) = &mut self.scribe {
+            scribe.lost(why);
+        }
         if let Some(live) = self.person() {
             return live.on_lost(why);
         }
@@ -237,6 +250,9 @@ impl Task {
 
     /// The session reports.
     pub fn on_event(&mut self, now: Stamp, event: &Event) {
+        if let Some(scribe) = &mut self.scribe {
+            scribe.hear(now, event);
+        }
         if let Some(live) = self.person() {
             return live.on_event(now, event);
         }
@@ -274,6 +290,9 @@ impl Task {
 
     /// Feeds the session what is due at `now`.
     pub fn advise(&mut self, now: Stamp, session: &mut Session) -> Advice {
+        if let Some(scribe) = &mut self.scribe {
+            scribe.see(now, session);
+        }
         if let Some(live) = self.person() {
             live.advise(now, session);
             return Advice::Continue;

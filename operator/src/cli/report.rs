@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use telemime_endpoint::Mono;
 use telemime_endpoint::cli::Printer;
 use telemime_endpoint::meter::Counts;
+use telemime_endpoint::recording;
 use tokio::sync::mpsc;
 
 use super::played::Played;
@@ -243,6 +244,12 @@ pub enum Event {
     Saved {
         file: PathBuf,
     },
+    Recording {
+        file: PathBuf,
+        messages: u64,
+        dropped: u64,
+        error: Option<String>,
+    },
     Done {
         completed: bool,
         why: Option<String>,
@@ -431,6 +438,12 @@ impl Event {
                     novel.join(", ")
                 )
             }
+            Self::Recording {
+                file,
+                messages,
+                dropped,
+                error,
+            } => recording::told(file, *messages, *dropped, error.as_deref()),
             Self::Saved { file } => format!("saved {}", file.display()),
             Self::Done {
                 samples,
@@ -452,6 +465,18 @@ impl Event {
                 }
             ),
         })
+    }
+}
+
+impl Event {
+    /// What became of a recording.
+    pub(super) fn recording(outcome: &recording::Outcome) -> Self {
+        Self::Recording {
+            file: outcome.path.clone(),
+            messages: outcome.messages,
+            dropped: outcome.dropped,
+            error: outcome.error.as_ref().map(ToString::to_string),
+        }
     }
 }
 

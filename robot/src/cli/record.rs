@@ -1,4 +1,4 @@
-//! Every tick to a file, off the servo's thread.
+//! Every tick to a file, off the servo's thread; or a recording that viewers open.
 
 use std::fs::File;
 use std::io::{ErrorKind, Write as _};
@@ -7,10 +7,32 @@ use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 
 use anyhow::{Context, bail};
 
+use telemime_endpoint::recording;
+
+use super::report::Log;
+use crate::recording::Scribe;
+use crate::rig::Rig;
 use crate::servo::Report;
 
 /// Ticks on their way to the disk; a slow disk loses ticks, never the servo's time.
 const QUEUE: usize = 8192;
+
+/// Ticks as CSV, if that is what is wanted.
+pub(super) fn ticks(path: Option<&Path>, rig: &Rig) -> anyhow::Result<Option<TickRecorder>> {
+    let csv = path.filter(|path| !recording::is_named(path));
+    csv.map(|path| TickRecorder::start(path, rig.arm.dof()))
+        .transpose()
+}
+
+/// A recording that viewers open, if that is what is wanted.
+pub(super) fn scribe(path: Option<&Path>, rig: &Rig, log: &Log) -> anyhow::Result<Option<Scribe>> {
+    let Some(path) = path.filter(|path| recording::is_named(path)) else {
+        return Ok(None);
+    };
+    let log = log.clone();
+    let say = move |outcome| log.recording(&outcome);
+    Ok(Some(Scribe::start(path, rig, say)?))
+}
 
 /// A new file at `path`; where one is, at the same with the next free number.
 fn fresh(path: &Path) -> std::io::Result<(PathBuf, File)> {
@@ -42,7 +64,7 @@ pub(super) struct TickRecorder {
 }
 
 impl TickRecorder {
-    pub(super) fn start(path: &Path, dof: usize) -> anyhow::Result<Self> {
+    fn start(path: &Path, dof: usize) -> anyhow::Result<Self> {
         let (fresh, file) =
             fresh(path).with_context(|| format!("cannot write {}", path.display()))?;
         if fresh != path {
