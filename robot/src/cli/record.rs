@@ -68,11 +68,11 @@ impl TickRecorder {
         let (fresh, file) =
             fresh(path).with_context(|| format!("cannot write {}", path.display()))?;
         if fresh != path {
-            eprintln!(
-                "note: {} is there already; the ticks go to {}",
+            telemime_endpoint::logs::note(&format!(
+                "{} is there already; the ticks go to {}",
                 path.display(),
                 fresh.display()
-            );
+            ));
         }
         let (queue, reports) = sync_channel::<Report>(QUEUE);
         let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
@@ -117,10 +117,10 @@ impl TickRecorder {
             Err(_) => bail!("the recorder of {} failed", path.display()),
         }
         if lost > 0 {
-            eprintln!(
-                "note: {lost} ticks are missing in {}: the disk was too slow",
+            telemime_endpoint::logs::note(&format!(
+                "{lost} ticks are missing in {}: the disk was too slow",
                 path.display()
-            );
+            ));
         }
         Ok(())
     }

@@ -90,7 +90,7 @@ pub fn hello(line: &[u8]) -> Result<Hello, LineError> {
             found: hello.telemime_driver,
         });
     }
-    if !(hello.rate_hz >= 10.0 && hello.rate_hz <= 1000.0) {
+    if !(hello.rate_hz >= 10.0 && hello.rate_hz <= super::FASTEST_HZ) {
         return Err(LineError::Rate {
             value: hello.rate_hz,
         });

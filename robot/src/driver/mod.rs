@@ -27,6 +27,9 @@ const TOO_FAST: (f64, f64) = (1.5, 0.1);
 /// A joint may leap by this much beyond what its speed explains, rad or m.
 const LEAP: f64 = 0.05;
 
+/// Most states a second that a driver may tell.
+pub const FASTEST_HZ: f64 = 1000.0;
+
 /// How long an arm may be silent or behind if nothing is said, s.
 pub const PATIENCE_S: f64 = 0.1;
 
