@@ -263,13 +263,15 @@ pub enum Event {
         samples_at_rest: u32,
         glitches: u32,
         messages: u32,
+        messages_at_rest: u32,
         knots: u32,
+        knots_at_rest: u32,
         sessions: u32,
         bytes_on_wire: u64,
         packets_on_wire: u64,
         bytes_session_up: u64,
         bytes_session_down: u64,
-        link: session::Seen,
+        link: Box<session::Seen>,
     },
 }
 
@@ -292,13 +294,15 @@ impl Event {
             samples_at_rest: summary.counters.rest_samples,
             glitches: summary.counters.glitches,
             messages: summary.counters.messages,
+            messages_at_rest: summary.counters.rest_messages,
             knots: summary.counters.knots,
+            knots_at_rest: summary.counters.rest_knots,
             sessions: summary.sessions,
             bytes_on_wire: motion.bytes,
             packets_on_wire: motion.packets,
             bytes_session_up: sent.bytes - motion.bytes,
             bytes_session_down: received.bytes,
-            link: summary.seen,
+            link: Box::new(summary.seen),
         }
     }
 
