@@ -14,7 +14,7 @@ use telemime_sim::arm::{DeadTime, LoadOptions};
 
 use super::{Args, surroundings};
 use crate::control::{BarrierConfig, ControlConfig, FilterConfig, LimitedFilter};
-use crate::driver::PATIENCE_S;
+use crate::driver::{DriverConfig, FASTEST_HZ, PATIENCE_S, PatienceError};
 use crate::rig::{Rig, RigOptions};
 use crate::servo::Priority;
 
@@ -200,7 +200,8 @@ impl Settings for Args {
         surroundings::contact(self)?;
         self.fingerprints()?;
         admin::own_name(self.name.as_deref())?;
-        self.patience_s()?;
+        // How often a driver speaks is not known before it does.
+        self.driving(FASTEST_HZ)?;
         self.realtime.map(Priority::new).transpose()?;
         cli::versions(self.protocol_max)?;
         let control = self.control()?;
@@ -240,14 +241,9 @@ impl Args {
         Ok(given.collect::<Result<_, _>>()?)
     }
 
-    /// How long a driver may be silent, s.
-    pub(super) fn patience_s(&self) -> anyhow::Result<f64> {
-        let patience_s = self.driver_patience.unwrap_or(PATIENCE_S);
-        ensure!(
-            (0.01..=10.0).contains(&patience_s),
-            "--driver-patience {patience_s} s: from 10ms to 10s"
-        );
-        Ok(patience_s)
+    /// How a driver is waited for that tells its state `rate_hz` times a second.
+    pub(super) fn driving(&self, rate_hz: f64) -> Result<DriverConfig, PatienceError> {
+        DriverConfig::new(rate_hz, self.driver_patience.unwrap_or(PATIENCE_S))
     }
 
     /// The arm and how it is driven, as far as no driver says more.
@@ -315,8 +311,8 @@ mod tests {
             let (said, not) = (with(key).control().unwrap(), nothing.control().unwrap());
             assert_eq!(format!("{said:?}"), format!("{not:?}"), "{key}");
         }
-        let patience = with("driver_patience_s").patience_s().unwrap();
-        assert_eq!(patience, nothing.patience_s().unwrap());
+        let driving = with("driver_patience_s").driving(250.0).unwrap();
+        assert_eq!(driving, nothing.driving(250.0).unwrap());
         let versions = |args: &Args| cli::versions(args.protocol_max).unwrap();
         assert_eq!(versions(&with("protocol_max")), versions(&nothing));
         assert_eq!(with("listen").listen, LISTEN.parse().ok());

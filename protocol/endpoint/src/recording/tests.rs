@@ -232,7 +232,7 @@ fn a_message_of_ours_is_what_its_schema_says() {
         plan_s: Some(0.1),
         jerk_m_s3: 0.1,
         orientation_error_rad: 0.1,
-        opening: 0.5,
+        opening: Some(0.5),
         fault: Some("none".into()),
     });
 }
