@@ -10,6 +10,7 @@ pub mod ingest;
 pub mod learn;
 pub mod lessons;
 pub mod placed;
+pub mod program;
 pub mod recognise;
 pub mod recording;
 pub mod session;
