@@ -11,8 +11,8 @@ use telemime_sim::link::{
 };
 
 use crate::{
-    arm, codec, demo, evaluate, experiment, ingest, link, paper, recognise, replay, select, tap,
-    teach,
+    arm, codec, demo, evaluate, experiment, ingest, link, paper, recognise, replay, select, send,
+    tap, teach,
 };
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
@@ -57,6 +57,8 @@ enum Command {
     Robot(telemime_robot::cli::Args),
     /// Run a robot's black box again, and tell what happened.
     Replay(replay::Args),
+    /// Send a recording at true speed, as a tracker would.
+    Send(send::Args),
     Arm(arm::Args),
     Identity(admin::IdentityArgs),
     Pair(telemime_operator::cli::PairArgs),
@@ -163,6 +165,7 @@ pub fn main() -> ExitCode {
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),
         Some(Command::Replay(args)) => replay::run(args),
+        Some(Command::Send(args)) => send::run(args),
         Some(Command::Arm(args)) => arm::run(args),
         Some(Command::Identity(args)) => admin::identity(args, Role::Operator),
         Some(Command::Pair(args)) => telemime_operator::cli::pair(args),

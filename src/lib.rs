@@ -25,5 +25,6 @@ mod recognise;
 pub mod relay;
 mod replay;
 mod select;
+mod send;
 mod tap;
 mod teach;

@@ -12,7 +12,7 @@ use telemime_endpoint::cli::one_line;
 use telemime_operator::ingest::segment::Method;
 use telemime_operator::ingest::{
     Axes, Columns, Cut, Format, Imported, IngestError, LengthUnit, MAX_GAP_S, Options, Report,
-    TimeUnit, import,
+    TimeUnit, grip_range, import,
 };
 
 /// Make demonstrations of raw recordings: Kinect or OpenNI skeletons, or tables of a hand's path.
@@ -59,7 +59,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
     axes: Option<Axes>,
     /// Readings of the gripper when it is closed and when it is open.
-    #[arg(long, value_name = "CLOSED,OPEN", default_value = "0,1", value_parser = range, allow_hyphen_values = true)]
+    #[arg(long, value_name = "CLOSED,OPEN", default_value = "0,1", value_parser = grip_range, allow_hyphen_values = true)]
     grip_range: (f64, f64),
     /// Smooth without shifting in time, −3 dB at this frequency [default: no smoothing].
     #[arg(long, value_name = "HZ", value_parser = positive)]
@@ -92,14 +92,6 @@ fn positive(text: &str) -> Result<f64, String> {
         .ok()
         .filter(|v: &f64| *v > 0.0 && v.is_finite())
         .ok_or_else(|| format!("{text:?} is not a number above 0"))
-}
-
-fn range(text: &str) -> Result<(f64, f64), String> {
-    let number = |t: &str| t.trim().parse().ok().filter(|v: &f64| v.is_finite());
-    text.split_once(',')
-        .and_then(|(closed, open)| number(closed).zip(number(open)))
-        .filter(|(closed, open)| closed != open)
-        .ok_or_else(|| format!("{text:?} is not two different numbers, as 0,0.08"))
 }
 
 fn folder_name(text: &str) -> Result<String, String> {

@@ -19,6 +19,7 @@ mod frames;
 mod gate;
 mod horizon;
 mod ingest;
+mod input;
 mod interop;
 mod layout;
 mod link;

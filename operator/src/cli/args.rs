@@ -10,15 +10,17 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 use serde::Deserialize;
 use telemime_endpoint::cli;
 
+use super::input::{InputArgs, InputFile};
 use crate::console::Shape;
 use crate::placed::Placed;
 use crate::session::{FutureBound, SessionConfig};
 
 /// Teach, drive and play a robot.
 ///
-/// Replays a recording as if the hand were there (--replay), or plays a learned skill (--play). The robot must be
+/// Follows a tracked hand (--input), replays a recording as if the hand were there (--replay), or plays a learned
+/// skill (--play). The robot must be
 /// known: pair with it once (`telemime pair HOST:PORT`), or give the fingerprint it prints with --peer. On the
-/// terminal, type stop (emergency stop), reset, or quit; keep takes the performance driven last as a demonstration,
+/// terminal, type stop (emergency stop), reset, or quit; engage and release are the clutch of --input; keep takes the performance driven last as a demonstration,
 /// refine learns from those kept, and save FILE writes the skill as it is now.
 #[derive(clap::Args, Debug, Clone, Default)]
 pub struct Args {
@@ -101,6 +103,9 @@ pub struct Args {
     /// Tip metres per hand metre [default: from the demonstrations and the arm's limits].
     #[arg(long)]
     pub scale: Option<f64>,
+    /// A hand that is tracked while it drives.
+    #[command(flatten)]
+    pub input: InputArgs,
     /// The hand's axes [default: kinect].
     #[arg(long, value_enum)]
     pub axes: Option<Axes>,
@@ -237,14 +242,6 @@ fn parse_latency(text: &str) -> Result<f64, String> {
         .ok_or_else(|| format!("`{text}`: write a time from 0 to {MAX_LATENCY_MS} ms (62ms)"))
 }
 
-/// Settings of the input.
-#[derive(Debug, Clone, Default, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Input {
-    latency_ms: Option<f64>,
-    glitch_gate: Option<bool>,
-}
-
 /// One file, or several.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(untagged)]
@@ -290,7 +287,7 @@ struct File {
     scale: Option<f64>,
     axes: Option<Axes>,
     #[serde(default)]
-    input: Input,
+    input: InputFile,
     gain: Option<f64>,
     future_bound: Option<String>,
     path_bound_m: Option<f64>,
@@ -333,7 +330,8 @@ impl Args {
             (self.learn, self.skill) = (file.learn, file.skills);
         }
         self.matching = self.matching.or(file.matching);
-        if self.replay.is_empty() && self.play.is_none() && self.console.is_none() {
+        let free = self.replay.is_empty() && self.play.is_none() && self.console.is_none();
+        if free && self.input.input.is_none() {
             self.replay = file.replay.map_or_else(Vec::new, Vec::from);
             self.play = file.play;
             self.console = file.console;
@@ -351,6 +349,9 @@ impl Args {
             self.input_latency = Some(latency);
         }
         self.glitch_gate |= file.input.glitch_gate.unwrap_or(false);
+        let other = self.play.is_some() || self.console.is_some() || !self.replay.is_empty();
+        let input = self.input.over(file.input, !other);
+        input.with_context(|| path.display().to_string())?;
         if self.frame.is_empty() && self.play.is_some() {
             self.frame = file
                 .frames

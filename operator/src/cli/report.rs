@@ -13,6 +13,7 @@ use tokio::sync::mpsc;
 use super::played::Played;
 use crate::console::Shape;
 use crate::daemon::{Notice, Summary};
+use crate::input::Tally;
 use crate::learn::align::Aligned;
 use crate::recognise::Verdict;
 use crate::session::{self, Change};
@@ -229,6 +230,9 @@ pub enum Event {
     Console {
         url: String,
     },
+    Input {
+        source: String,
+    },
     LinkAsked(Shape),
     Kept {
         name: String,
@@ -251,6 +255,7 @@ pub enum Event {
         samples: u32,
         samples_at_rest: u32,
         glitches: u32,
+        input: Option<Tally>,
         messages: u32,
         knots: u32,
         sessions: u32,
@@ -280,6 +285,7 @@ impl Event {
             samples: summary.counters.samples,
             samples_at_rest: summary.counters.rest_samples,
             glitches: summary.counters.glitches,
+            input: task.tally().cloned(),
             messages: summary.counters.messages,
             knots: summary.counters.knots,
             sessions: summary.sessions,
@@ -403,6 +409,7 @@ impl Event {
             }
             // With one performance, the line at the end says all.
             Self::Performed { .. } => return None,
+            Self::Input { source } => format!("the hand comes from {source}"),
             Self::Console { url } => format!("the page is at {url}"),
             Self::LinkAsked(_) => return None,
             Self::Kept { name } => format!("kept as {name}"),

@@ -30,7 +30,7 @@ use nalgebra::Vector3;
 pub use columns::Columns;
 pub use error::{Fault, IngestError};
 pub use report::{Cuts, Report, TakeReport};
-pub use units::{Axes, Format, LengthUnit, TimeUnit};
+pub use units::{Axes, Format, LengthUnit, TimeUnit, grip_range};
 
 use crate::demonstration::{LARGEST_EXTENT_M, LEAST_SAMPLES};
 use order::Scale;

@@ -82,6 +82,18 @@ impl TimeUnit {
     }
 }
 
+/// The gripper's readings when closed and when open, as `0,0.08`.
+///
+/// # Errors
+/// One line that says what to write.
+pub fn grip_range(text: &str) -> Result<(f64, f64), String> {
+    let number = |t: &str| t.trim().parse().ok().filter(|v: &f64| v.is_finite());
+    text.split_once(',')
+        .and_then(|(closed, open)| number(closed).zip(number(open)))
+        .filter(|(closed, open)| closed != open)
+        .ok_or_else(|| format!("{text:?} is not two different numbers, as 0,0.08"))
+}
+
 /// A relabelling of axes: which signed source axis each of ours is.
 ///
 /// ```

@@ -17,10 +17,11 @@ use telemime_protocol::wire::arm::WireArm;
 use telemime_protocol::wire::v1::{Cause, RobotState, Telemetry};
 use tokio::sync::{mpsc, watch};
 
-use hold::{Hold, Phase};
+use hold::Hold;
 
 use super::snapshot::Seen;
 use super::{Command, Shape, Snapshot};
+use crate::clutch::Phase;
 use crate::demonstration::{Demonstration, Sample};
 use crate::recognise::{Recogniser, Verdict};
 use crate::session::{Event, Session};
@@ -376,10 +377,9 @@ impl Live {
                 self.note("the page that drove fell silent: the clutch is let go");
                 self.let_go(Some(session));
             }
-            Some(Hold {
-                phase: Phase::Again(at),
-                ..
-            }) if now >= *at => self.ask(now, session),
+            Some(hold) if hold.clutch.again().is_some_and(|at| now >= at) => {
+                self.ask(now, session);
+            }
             _ => {}
         }
         if now >= self.next {
@@ -394,10 +394,7 @@ impl Live {
             .hold
             .as_ref()
             .map(|hold| hold.heard.offset_by_secs(LEASE_S));
-        let again = self.hold.as_ref().and_then(|hold| match hold.phase {
-            Phase::Again(at) => Some(at),
-            _ => None,
-        });
+        let again = self.hold.as_ref().and_then(|hold| hold.clutch.again());
         // The server keeps one receiver; the others are pages that look.
         let snapshot = (self.shown.receiver_count() > 1).then_some(self.next);
         [lease, again, snapshot].into_iter().flatten().min()

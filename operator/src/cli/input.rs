@@ -1,0 +1,117 @@
+//! Flags of a tracked hand.
+
+use std::net::IpAddr;
+
+use anyhow::bail;
+use serde::Deserialize;
+
+use super::report::{Event, Log};
+use crate::ingest::{LengthUnit, TimeUnit, grip_range};
+use crate::input::{Driver, Habits, Source, Units, read};
+use crate::task::Task;
+
+/// A hand that is tracked while it drives.
+#[derive(clap::Args, Debug, Clone, Default)]
+pub struct InputArgs {
+    /// Follow a tracked hand, live: lines of JSON on standard input (-) or in UDP datagrams (udp:PORT on this host,
+    /// udp:ADDRESS:PORT); docs/input.md has the format.
+    #[arg(long, value_name = "SOURCE", conflicts_with_all = ["replay", "play", "console", "correct", "refine"])]
+    pub input: Option<Source>,
+    /// UDP: hear this sender only; needed to listen beyond this host.
+    #[arg(long, value_name = "IP")]
+    pub input_from: Option<IpAddr>,
+    /// Which joint of a skeleton is the hand [default: right_hand].
+    #[arg(long, value_name = "JOINT")]
+    pub joint: Option<String>,
+    /// Unit of the input's lengths: m, cm or mm [default: m].
+    #[arg(long, value_name = "UNIT")]
+    pub unit: Option<LengthUnit>,
+    /// Unit of the input's times: s, ms, us or ns [default: s].
+    #[arg(long, value_name = "UNIT")]
+    pub time_unit: Option<TimeUnit>,
+    /// Readings of the input's gripper when it is closed and when it is open [default: 0,1].
+    #[arg(long, value_name = "CLOSED,OPEN", value_parser = grip_range, allow_hyphen_values = true)]
+    pub grip_range: Option<(f64, f64)>,
+    /// Engage with the input's first sample, for a source that says nothing of a clutch. After a loss: type engage.
+    #[arg(long)]
+    pub engage: bool,
+    /// Leave once the input has ended [default: release, and stay].
+    #[arg(long)]
+    pub until_end: bool,
+}
+
+/// `[input]` of the configuration file.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct InputFile {
+    pub(super) latency_ms: Option<f64>,
+    pub(super) glitch_gate: Option<bool>,
+    pub(super) source: Option<String>,
+    from: Option<IpAddr>,
+    joint: Option<String>,
+    unit: Option<String>,
+    time_unit: Option<String>,
+    grip_range: Option<(f64, f64)>,
+    engage: Option<bool>,
+    until_end: Option<bool>,
+}
+
+/// A word of the file, as the flag of that name takes it.
+fn word<T: std::str::FromStr<Err = String>>(
+    key: &str,
+    text: Option<String>,
+) -> anyhow::Result<Option<T>> {
+    let parsed = text.map(|text| text.parse()).transpose();
+    parsed.map_err(|e| anyhow::anyhow!("[input] {key} = {e}"))
+}
+
+impl InputArgs {
+    /// Over what the file says; its source counts only where no flag names another task.
+    pub(super) fn over(&mut self, file: InputFile, free: bool) -> anyhow::Result<()> {
+        let source = word("source", file.source)?;
+        if self.input.is_none() && free {
+            self.input = source;
+        }
+        self.input_from = self.input_from.or(file.from);
+        self.joint = self.joint.take().or(file.joint);
+        self.unit = self.unit.or(word("unit", file.unit)?);
+        self.time_unit = self.time_unit.or(word("time_unit", file.time_unit)?);
+        if file
+            .grip_range
+            .is_some_and(|(closed, open)| !(closed != open))
+        {
+            bail!("[input] grip_range: closed and open are the same");
+        }
+        self.grip_range = self.grip_range.or(file.grip_range);
+        self.engage |= file.engage.unwrap_or(false);
+        self.until_end |= file.until_end.unwrap_or(false);
+        Ok(())
+    }
+
+    /// The task of following `source`, which is read from now on.
+    pub(super) fn task(
+        &self,
+        source: &Source,
+        clock: read::Clock,
+        log: &Log,
+    ) -> anyhow::Result<Task> {
+        let defaults = Units::default();
+        let units = Units {
+            length: self.unit.unwrap_or(defaults.length),
+            time: self.time_unit.unwrap_or(defaults.time),
+            grip: self.grip_range.unwrap_or(defaults.grip),
+            joint: self.joint.clone().unwrap_or(defaults.joint),
+        };
+        let (inlet, name) = read::open(source, self.input_from, units, clock)?;
+        log.say(&Event::Input { source: name });
+        let habits = Habits {
+            engage: self.engage,
+            until_end: self.until_end,
+        };
+        Ok(Task::input(Driver::new(
+            inlet.arrived,
+            inlet.overflow,
+            habits,
+        )))
+    }
+}
