@@ -347,9 +347,6 @@ fn robot_datagrams() {
         newest_seq: 252,
         dropped: 4,
         clamps: 5,
-        tick_mean_ns: 6_000,
-        tick_p99_ns: 70_000,
-        overruns: 6,
         tip_m: [0.5, 0.0, -0.5],
         tip_q: WireRotation([125, -126, 0]),
         grip: Some(255),
@@ -365,7 +362,7 @@ fn robot_datagrams() {
         ),
         (
             RobotDatagram::Telemetry(telemetry),
-            "0101020203fc0ead2500fb50c36e69fafbfb00fbfc000405fb7017fc70110100060000003f000000 \
+            "0101020203fc0ead2500fb50c36e69fafbfb00fbfc0004050000003f000000 \
              00000000bffafbfb000001ff020000803f000000c0",
         ),
         (
@@ -382,6 +379,17 @@ fn robot_datagrams() {
                 age_us: [180_000, 0, 250, 251],
             }),
             "0201fbfc00fa01030201fba00ffca0860100fcb8820100fcb0ad0100fc00000100fc20bf020000fafbfb00",
+        ),
+        (
+            RobotDatagram::Servo(ServoTimes {
+                epoch: 1,
+                ticks: 60_000,
+                overruns: 6,
+                mean_ns: 6_000,
+                work_ns: [5_500, 70_000, 70_001, 4_000_000],
+                wake_ns: [250, 251, 65_536, 0],
+            }),
+            "0301fb60ea06fb7017fb7c15fc70110100fc71110100fc00093d00fafbfb00fc0000010000",
         ),
     ]);
 }

@@ -437,7 +437,7 @@ fn operator_datagram() -> impl Strategy<Value = OperatorDatagram> {
 
 fn robot_datagram() -> impl Strategy<Value = RobotDatagram> {
     let telemetry = (
-        any::<[u32; 12]>(),
+        any::<[u32; 9]>(),
         any::<[u16; 2]>(),
         any::<i64>(),
         robot_state(),
@@ -461,9 +461,6 @@ fn robot_datagram() -> impl Strategy<Value = RobotDatagram> {
                     newest_seq: n[6],
                     dropped: n[7],
                     clamps: n[8],
-                    tick_mean_ns: n[9],
-                    tick_p99_ns: n[10],
-                    overruns: n[11],
                     tip_m,
                     tip_q,
                     grip,
@@ -491,6 +488,22 @@ fn robot_datagram() -> impl Strategy<Value = RobotDatagram> {
                 })
             }
         ),
+        (
+            any::<[u32; 3]>(),
+            any::<u64>(),
+            any::<[u32; 4]>(),
+            any::<[u32; 4]>()
+        )
+            .prop_map(|([epoch, overruns, mean_ns], ticks, work_ns, wake_ns)| {
+                RobotDatagram::Servo(ServoTimes {
+                    epoch,
+                    ticks,
+                    overruns,
+                    mean_ns,
+                    work_ns,
+                    wake_ns,
+                })
+            }),
     ]
 }
 

@@ -22,9 +22,9 @@ use crate::clock::Origin;
 use crate::desk::{Desk, Progress};
 use crate::door::{self, Door, Place, Verdict};
 use crate::refused::{Reason, Refused, Tally};
-use crate::servo::thread::Timing;
+use crate::servo::thread::{Times, Timing};
 use crate::servo::{ArmFault, Handle, Order, Report};
-use crate::session::{Counters, Output, Seen, Session, SessionConfig, TickTiming};
+use crate::session::{Counters, Output, Seen, Session, SessionConfig};
 
 /// How often reports are taken from the servo's ring.
 const DRAIN: Duration = Duration::from_millis(4);
@@ -437,14 +437,7 @@ impl Daemon {
         let timing = self
             .timing
             .as_deref()
-            .map_or_else(TickTiming::default, |timing| {
-                let times = timing.read();
-                TickTiming {
-                    mean_ns: times.mean_ns,
-                    p99_ns: times.work.p99_ns,
-                    overruns: times.overruns,
-                }
-            });
+            .map_or_else(Times::default, |timing| timing.read());
         while let Ok(report) = self.servo.reports.pop() {
             self.silent_drains = 0;
             self.info.state = report.state;

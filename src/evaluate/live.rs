@@ -8,7 +8,6 @@ use telemime_operator::session::{HandSample, Output, Session, SessionConfig};
 use telemime_protocol::predict::{Forecast, TurnForecast};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
-use telemime_protocol::wire::turn::WireRotation;
 use telemime_protocol::wire::v1::{
     Info, MAX_TAIL_KNOTS, Message, Motion, OperatorDatagram, RobotControl, RobotDatagram,
     RobotState, Telemetry,
@@ -87,22 +86,9 @@ impl Live {
             seq: self.acknowledged,
             state: RobotState::Engaged,
             engagement: 1,
-            t_us: 0,
-            clock_uncertainty_us: 0,
-            age_ms: 0,
             delay_ms: (self.delay_s * 1e3).round() as u16,
             path_frontier,
-            received: 0,
-            newest_seq: 0,
-            dropped: 0,
-            clamps: 0,
-            tick_mean_ns: 0,
-            tick_p99_ns: 0,
-            overruns: 0,
-            tip_m: [0.0; 3],
-            tip_q: WireRotation::default(),
-            grip: None,
-            q: Vec::new(),
+            ..Telemetry::default()
         });
         self.session
             .handle_datagram(on_session_clock(at_s), &telemetry.encode());

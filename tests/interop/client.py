@@ -77,6 +77,8 @@ class Operator(QuicConnectionProtocol):
             self.datagram({"Pong": {"epoch": self.epoch, "t1_us": fields["t1_us"], "t2_us": now, "t3_us": now}})
         elif name == "Reception":
             self.reception = fields
+        elif name == "Servo":
+            self.servo = fields
         else:
             self.telemetry.append(fields)
             self.fresh.set()

@@ -67,6 +67,8 @@ class Document(unittest.TestCase):
         r = messages.read("robot datagram", document.example("reception"))["Reception"]
         self.assertEqual((r["newest_seq"], r["received"], r["longest_loss_run"]), (42, 40, 2))
         self.assertEqual((r["delay_us"][2], r["age_us"][3]), (109_000, 310_000))
+        s = messages.read("robot datagram", document.example("servo"))["Servo"]
+        self.assertEqual((s["ticks"], s["overruns"], s["work_ns"][2], s["wake_ns"][1]), (60_000, 2, 12_000, 90_000))
         stream = document.example("frame")
         self.assertEqual(frames.parse(stream), (b"\x05", False, 5))
         self.assertEqual(messages.read("operator control", b"\x05"), "EmergencyStop")

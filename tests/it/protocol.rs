@@ -28,11 +28,12 @@ use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::{
     self, Cause, Drive, Engage, ExternalClock, Info, Message, Motion, OperatorControl,
     OperatorDatagram, PathTail, Reception, Refusal, RobotControl, RobotDatagram, RobotState,
-    Telemetry, WireParams, model_tag,
+    ServoTimes, Telemetry, WireParams, model_tag,
 };
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo;
-use telemime_robot::session::{Output, Session, SessionConfig, TickTiming};
+use telemime_robot::servo::thread::Times;
+use telemime_robot::session::{Output, Session, SessionConfig};
 
 const STATE: WireState = WireState {
     t_us: 3_000_000,
@@ -264,9 +265,6 @@ fn telemetry() -> Telemetry {
         newest_seq: 42,
         dropped: 0,
         clamps: 3,
-        tick_mean_ns: 12_000,
-        tick_p99_ns: 30_000,
-        overruns: 0,
         tip_m: [0.5, 0.0, 0.25],
         tip_q: TIP_Q,
         grip: Some(255),
@@ -496,6 +494,17 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
                 age_us: [150_000, 145_000, 240_000, 310_000],
             })),
         ),
+        (
+            "servo",
+            message(&RobotDatagram::Servo(ServoTimes {
+                epoch: 7,
+                ticks: 60_000,
+                overruns: 2,
+                mean_ns: 5_600,
+                work_ns: [5_400, 7_400, 12_000, 80_000],
+                wake_ns: [55_000, 90_000, 400_000, 1_200_000],
+            })),
+        ),
         ("plan", codec::encode(&plan())),
         ("pair-offer", pairing(PairMessage::Offer(name("laptop")))),
         (
@@ -689,7 +698,7 @@ fn a_plan_that_does_not_begin_at_zero_is_refused() {
     let (rings, _handle) = servo::rings();
     let report = rig.servo(rings).tick(Mono(0));
     let mut session = Session::new(SessionConfig::default(), rig.info(), 1, None, Mono(0));
-    session.handle_report(&report, TickTiming::default());
+    session.handle_report(&report, Times::default());
     // Before it knows the clock it judges no request at all.
     for _ in 0..4 {
         let pong = OperatorDatagram::Pong {

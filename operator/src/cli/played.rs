@@ -164,7 +164,6 @@ impl Played {
 mod tests {
     use super::*;
     use telemime_protocol::checkpoint::select;
-    use telemime_protocol::wire::turn::WireRotation;
 
     #[test]
     fn a_tip_that_does_as_it_is_told_scores_one() {
@@ -200,21 +199,9 @@ mod tests {
                 state: RobotState::Engaged,
                 engagement: 3,
                 t_us: 1_000_000 + i64::from(i) * 50_000,
-                clock_uncertainty_us: 0,
-                age_ms: 0,
-                delay_ms: 0,
-                path_frontier: 0,
-                received: 0,
-                newest_seq: 0,
-                dropped: 0,
                 clamps: i as u32 * 7,
-                tick_mean_ns: 0,
-                tick_p99_ns: 0,
-                overruns: 0,
                 tip_m: tip.cast::<f32>().into(),
-                tip_q: WireRotation::default(),
-                grip: None,
-                q: Vec::new(),
+                ..Telemetry::default()
             };
             played.hear(&session::Event::Telemetry(Box::new(telemetry)));
         }

@@ -136,6 +136,11 @@ impl Session {
                     self.up = Some(told);
                 }
             }
+            Ok(RobotDatagram::Servo(times)) if times.epoch == self.epoch => {
+                if self.servo.is_none_or(|last| last.ticks <= times.ticks) {
+                    self.servo = Some(times);
+                }
+            }
             _ => self.counters.dropped += 1,
         }
     }

@@ -30,7 +30,7 @@ use telemime_protocol::wire::arm::WireArm;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::v1::{
     Drive, Engage, ExternalClock, Info, Message, OperatorControl, OperatorDatagram, PathTail,
-    Reception as Told, Refusal, RobotState,
+    Reception as Told, Refusal, RobotState, ServoTimes,
 };
 
 use crate::recognise::{Recogniser, Verdict};
@@ -98,6 +98,8 @@ pub struct Session {
     repeat: Option<Stamp>,
     down: Reception,
     up: Option<Told>,
+    /// How the robot's servo keeps its time, as it said last.
+    servo: Option<ServoTimes>,
     clock_uncertainty_us: Option<u32>,
     last_sent: Stamp,
     /// There was something to say before the shortest interval was over.
@@ -142,6 +144,7 @@ impl Session {
             repeat: None,
             down: Reception::default(),
             up: None,
+            servo: None,
             clock_uncertainty_us: None,
             last_sent: Stamp::ZERO,
             urgent: false,
@@ -200,7 +203,10 @@ impl Session {
 
     /// What has become of the session's datagrams on their way.
     pub fn seen(&self) -> Seen {
-        Seen::new(self.up.as_ref(), &self.down, self.clock_uncertainty_us)
+        Seen {
+            servo: self.servo,
+            ..Seen::new(self.up.as_ref(), &self.down, self.clock_uncertainty_us)
+        }
     }
 
     /// Tip metres per hand metre of the next engagement; `None` before the robot has introduced itself.

@@ -184,7 +184,6 @@ impl Pace {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use telemime_protocol::wire::turn::WireRotation;
     use telemime_protocol::wire::v1::RobotState;
 
     fn heard(newest_seq: u32, received: u32, delay_ms: u16) -> Telemetry {
@@ -193,22 +192,10 @@ mod tests {
             seq: newest_seq,
             state: RobotState::Engaged,
             engagement: 1,
-            t_us: 0,
-            clock_uncertainty_us: 0,
-            age_ms: 0,
             delay_ms,
-            path_frontier: 0,
             received,
             newest_seq,
-            dropped: 0,
-            clamps: 0,
-            tick_mean_ns: 0,
-            tick_p99_ns: 0,
-            overruns: 0,
-            tip_m: [0.0; 3],
-            tip_q: WireRotation::default(),
-            grip: None,
-            q: Vec::new(),
+            ..Telemetry::default()
         }
     }
 

@@ -7,7 +7,9 @@ use std::fmt;
 use nalgebra::UnitQuaternion;
 use serde::{Deserialize, Serialize};
 use telemime_endpoint::reception::{Quantiles, Received, Reception};
-use telemime_protocol::wire::v1::{Cause, Reception as Told, Refusal, RobotState, Telemetry};
+use telemime_protocol::wire::v1::{
+    Cause, Reception as Told, Refusal, RobotState, ServoTimes, Telemetry,
+};
 
 /// What a session wants sent.
 #[derive(Debug, Clone, PartialEq)]
@@ -106,6 +108,8 @@ pub struct Seen {
     pub down: Received,
     /// How wrong the robot's estimate of the session clock may be, s: so may the delays, in opposite directions.
     pub clock_bound_s: Option<f64>,
+    /// How the robot's servo has kept its time.
+    pub servo: Option<ServoTimes>,
 }
 
 impl Seen {
@@ -135,8 +139,13 @@ impl Seen {
             clock_bound_s: clock_us
                 .filter(|us| *us != u32::MAX)
                 .map(|us| f64::from(us) * 1e-6),
+            servo: None,
         }
     }
+}
+
+fn us(ns: u32) -> f64 {
+    f64::from(ns) * 1e-3
 }
 
 impl fmt::Display for Seen {
@@ -150,6 +159,15 @@ impl fmt::Display for Seen {
         }
         if let Some(bound_s) = self.clock_bound_s {
             write!(f, "; clock known to ±{:.2} ms", bound_s * 1e3)?;
+        }
+        if let Some(servo) = &self.servo {
+            let [work, _, rarely, _] = servo.work_ns.map(us);
+            let [wake, _, seldom, _] = servo.wake_ns.map(us);
+            write!(
+                f,
+                "\nthe robot's ticks take {work:.1} µs, one in a thousand over {rarely:.1}, and begin {wake:.0} µs late, one in a thousand over {seldom:.0}; {} of {} overran",
+                servo.overruns, servo.ticks
+            )?;
         }
         Ok(())
     }

@@ -51,22 +51,11 @@ fn telemetry(seq: u32, path_frontier: u32) -> Telemetry {
         seq,
         state: RobotState::Engaged,
         engagement: 1,
-        t_us: 0,
         clock_uncertainty_us: 50_000,
         age_ms: 100,
         delay_ms: 100,
         path_frontier,
-        received: 0,
-        newest_seq: 0,
-        dropped: 0,
-        clamps: 0,
-        tick_mean_ns: 0,
-        tick_p99_ns: 0,
-        overruns: 0,
-        tip_m: [0.0; 3],
-        tip_q: WireRotation::default(),
-        grip: None,
-        q: Vec::new(),
+        ..Telemetry::default()
     }
 }
 

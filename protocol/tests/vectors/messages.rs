@@ -242,13 +242,21 @@ fn telemetry(draw: &mut Draw) -> Telemetry {
         newest_seq: draw.u32(),
         dropped: draw.u32(),
         clamps: draw.u32(),
-        tick_mean_ns: draw.u32(),
-        tick_p99_ns: draw.u32(),
-        overruns: draw.u32(),
         tip_m: std::array::from_fn(|_| draw.fraction()),
         tip_q: draw.rotation(),
         grip: draw.maybe(Draw::u8),
         q: (0..draw.below(11)).map(|_| draw.fraction()).collect(),
+    }
+}
+
+fn servo(draw: &mut Draw) -> ServoTimes {
+    ServoTimes {
+        epoch: draw.u32(),
+        ticks: draw.signed(53).unsigned_abs(),
+        overruns: draw.u32(),
+        mean_ns: draw.u32(),
+        work_ns: std::array::from_fn(|_| draw.u32()),
+        wake_ns: std::array::from_fn(|_| draw.u32()),
     }
 }
 
@@ -446,6 +454,10 @@ pub(crate) fn messages() -> Vec<Vector> {
     for joints in [0, 1, 7, 10] {
         let m = RobotControl::Arm(arm(draw, joints));
         all.push(message(ROBOT_CONTROL, format!("arm of {joints}"), &m));
+    }
+    for i in 0..4 {
+        let m = RobotDatagram::Servo(servo(draw));
+        all.push(message(ROBOT_DATAGRAM, format!("servo {i}"), &m));
     }
     all
 }

@@ -514,25 +514,9 @@ fn datagrams(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
     let telemetry = |q: Vec<f32>, tip| {
         RobotDatagram::Telemetry(Telemetry {
             epoch: 7,
-            seq: 300,
-            state: RobotState::Engaged,
-            engagement: 1,
-            t_us: 3_100_000,
-            clock_uncertainty_us: 100_500,
-            age_ms: 180,
-            delay_ms: 101,
-            path_frontier: 5,
-            received: 40,
-            newest_seq: 42,
-            dropped: 0,
-            clamps: 3,
-            tick_mean_ns: 12_000,
-            tick_p99_ns: 30_000,
-            overruns: 0,
             tip_m: [tip, 0.0, 0.0],
-            tip_q: Default::default(),
-            grip: None,
             q,
+            ..Telemetry::default()
         })
         .encode()
     };

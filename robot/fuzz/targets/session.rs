@@ -17,8 +17,9 @@ use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::v1::*;
 use telemime_robot::rig::{Rig, RigOptions};
+use telemime_robot::servo::thread::Times;
 use telemime_robot::servo::{self, Handle, Order};
-use telemime_robot::session::{Output, Session, TickTiming};
+use telemime_robot::session::{Output, Session};
 
 const EPOCH: u32 = 7;
 /// The session clock reads this much more than the robot's, ns.
@@ -103,7 +104,11 @@ impl Bench {
                         self.pings.push(t1_us);
                         self.pings.truncate(8);
                     }
-                    Ok(RobotDatagram::Telemetry(_) | RobotDatagram::Reception(_)) => {}
+                    Ok(
+                        RobotDatagram::Telemetry(_)
+                        | RobotDatagram::Reception(_)
+                        | RobotDatagram::Servo(_),
+                    ) => {}
                     Err(e) => panic!("{e}"),
                 },
                 Output::Order(order) => self.order(order),
@@ -124,7 +129,7 @@ impl Bench {
         self.ticks += 1;
         let report = self.core.tick(self.now);
         while let Ok(report) = self.handle.reports.pop() {
-            self.session.handle_report(&report, TickTiming::default());
+            self.session.handle_report(&report, Times::default());
         }
         while self.handle.spent.pop().is_ok() {}
         if self.session.poll_timeout().0 <= self.now {

@@ -22,12 +22,14 @@ use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::turn::{WireRotation, dequantise_grip, quantise_grip};
 use telemime_protocol::wire::v1::{
     self, Cause, Drive, Engage, ExternalClock, Info, MAX_PLAN_LEN, Message, ModelId,
-    OperatorControl, OperatorDatagram, Refusal, RobotControl, RobotDatagram, RobotState, Telemetry,
+    OperatorControl, OperatorDatagram, Refusal, RobotControl, RobotDatagram, RobotState,
+    ServoTimes, Telemetry,
 };
 use telemime_protocol::wire::{DecodeError, Version, Versions};
 
 use crate::clock::{SessionClock, Slew};
-use crate::servo::{Engagement, Lease, Order, Report, Source, Ticket, Trajectory};
+use crate::servo::thread::Times;
+use crate::servo::{self, Engagement, Lease, Order, Report, Source, Ticket, Trajectory};
 use motion::Mirror;
 
 /// Pings in quick succession at the start, so that the clock is known before the first engage.
@@ -81,17 +83,6 @@ pub enum Output {
     Goodbye,
 }
 
-/// How the servo's timing looks.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct TickTiming {
-    /// Mean work, ns.
-    pub mean_ns: u32,
-    /// 99th percentile, ns.
-    pub p99_ns: u32,
-    /// Late ticks.
-    pub overruns: u32,
-}
-
 /// What the session counts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counters {
@@ -137,7 +128,7 @@ pub struct Session {
     pacer: Pacer,
     report: Option<Report>,
     transitions: Option<u32>,
-    timing: TickTiming,
+    timing: Times,
     telemetry_seq: u32,
     pings: u32,
     next_ping: Mono,
@@ -176,7 +167,7 @@ impl Session {
             pacer: Pacer::new(config.telemetry_s, RAREST_TELEMETRY_S),
             report: None,
             transitions: None,
-            timing: TickTiming::default(),
+            timing: Times::default(),
             telemetry_seq: 0,
             pings: 0,
             next_ping: now,
@@ -371,7 +362,7 @@ impl Session {
     }
 
     /// The servo's report of a tick.
-    pub fn handle_report(&mut self, report: &Report, timing: TickTiming) {
+    pub fn handle_report(&mut self, report: &Report, timing: Times) {
         self.timing = timing;
         let changed = self.transitions != Some(report.transitions);
         self.transitions = Some(report.transitions);
@@ -429,6 +420,8 @@ impl Session {
             if self.pings.is_multiple_of(RECEPTION_PINGS) && self.reception.newest() > 0 {
                 let reception = RobotDatagram::Reception(self.told());
                 self.outputs.push_back(Output::Datagram(reception.encode()));
+                let servo = RobotDatagram::Servo(self.servo_times());
+                self.outputs.push_back(Output::Datagram(servo.encode()));
             }
         }
         if now >= self.next_telemetry {
@@ -603,6 +596,25 @@ impl Session {
         }
     }
 
+    fn servo_times(&self) -> ServoTimes {
+        let four = |q: servo::Quantiles| [q.p50_ns, q.p99_ns, q.p999_ns, q.max_ns];
+        let Times {
+            ticks,
+            mean_ns,
+            work,
+            wake,
+            overruns,
+        } = self.timing;
+        ServoTimes {
+            epoch: self.epoch,
+            ticks,
+            overruns,
+            mean_ns,
+            work_ns: four(work),
+            wake_ns: four(wake),
+        }
+    }
+
     fn telemetry(&mut self, now: Mono) -> Option<Telemetry> {
         let report = self.report?;
         self.telemetry_seq += 1;
@@ -629,9 +641,6 @@ impl Session {
             newest_seq: self.reception.newest(),
             dropped: self.dropped,
             clamps: report.clamps,
-            tick_mean_ns: self.timing.mean_ns,
-            tick_p99_ns: self.timing.p99_ns,
-            overruns: self.timing.overruns,
             tip_m: report.tip_m.cast::<f32>().into(),
             tip_q: WireRotation::quantise(&report.orientation),
             grip: Some(quantise_grip(report.opening)),

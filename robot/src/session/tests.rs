@@ -13,7 +13,8 @@ use telemime_protocol::wire::v1::{Motion, WireParams};
 use telemime_sim::arm::Joints;
 
 use super::*;
-use crate::servo::Mapping;
+use crate::servo::thread::Times;
+use crate::servo::{Mapping, Quantiles};
 
 mod control;
 mod datagrams;
@@ -207,7 +208,20 @@ impl Bench {
     }
 
     fn report(&mut self, report: &Report) {
-        self.session.handle_report(report, TickTiming::default());
+        let four = |at| Quantiles {
+            p50_ns: at,
+            p99_ns: at + 1,
+            p999_ns: at + 2,
+            max_ns: at + 3,
+        };
+        let times = Times {
+            ticks: 60_000,
+            mean_ns: 5_600,
+            work: four(1),
+            wake: four(5),
+            overruns: 2,
+        };
+        self.session.handle_report(report, times);
         self.drain();
     }
 

@@ -1,7 +1,7 @@
 """Every message of version 1 (§4, §5), field by field."""
 
 from . import path
-from .codec import (F32, I8, I32, I64, U8, U16, U32, Array, Bytes, Enum, Option, Struct, Text, Vec, WireError, decode, encode, finite, require)
+from .codec import (F32, I8, I32, I64, U8, U16, U32, U64, Array, Bytes, Enum, Option, Struct, Text, Vec, WireError, decode, encode, finite, require)
 from .frames import LONGEST
 from .state import PARAMS, POSE, ROTATION, STATE, _rotation_range
 
@@ -148,11 +148,13 @@ ROBOT_DATAGRAM = Enum(
     ("Telemetry", Struct(
         ("epoch", U32), ("seq", U32), ("state", STATES), ("engagement", U32), ("t_us", I64), ("clock_uncertainty_us", U32),
         ("age_ms", U16), ("delay_ms", U16), ("path_frontier", U32), ("received", U32), ("newest_seq", U32), ("dropped", U32),
-        ("clamps", U32), ("tick_mean_ns", U32), ("tick_p99_ns", U32), ("overruns", U32), ("tip_m", Array(F32, 3)),
+        ("clamps", U32), ("tip_m", Array(F32, 3)),
         ("tip_q", ROTATION), ("grip", Option(U8)), ("q", Vec(F32, 10)), check=_telemetry)),
     ("Reception", Struct(
         ("epoch", U32), ("newest_seq", U32), ("received", U32), ("duplicates", U32), ("reordered", U32), ("loss_runs", U32),
         ("longest_loss_run", U32), ("jitter_us", U32), ("delay_us", Array(U32, 4)), ("age_us", Array(U32, 4)))),
+    ("Servo", Struct(
+        ("epoch", U32), ("ticks", U64), ("overruns", U32), ("mean_ns", U32), ("work_ns", Array(U32, 4)), ("wake_ns", Array(U32, 4)))),
 )  # fmt: skip
 
 # Who sends what, and how long it may be.

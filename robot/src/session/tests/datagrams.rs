@@ -350,11 +350,13 @@ fn pings_and_telemetry_go_out_at_their_times() {
         bench.drain();
     }
     let (mut pings, mut telemetry, mut reception) = (0, Vec::new(), Vec::new());
+    let mut servo = Vec::new();
     for datagram in &bench.datagrams {
         match datagram {
             RobotDatagram::Ping { epoch: EPOCH, .. } => pings += 1,
             RobotDatagram::Telemetry(t) => telemetry.push(t.clone()),
             RobotDatagram::Reception(r) => reception.push(*r),
+            RobotDatagram::Servo(times) => servo.push(*times),
             other => panic!("{other:?}"),
         }
     }
@@ -368,6 +370,16 @@ fn pings_and_telemetry_go_out_at_their_times() {
         (1, 5, 1, 80)
     );
     assert!((2..=3).contains(&reception.len()), "{}", reception.len());
+    assert_eq!(servo.len(), reception.len());
+    let times = ServoTimes {
+        epoch: EPOCH,
+        ticks: 60_000,
+        overruns: 2,
+        mean_ns: 5_600,
+        work_ns: [1, 2, 3, 4],
+        wake_ns: [5, 6, 7, 8],
+    };
+    assert_eq!(servo[0], times);
     let r = &reception[0];
     assert_eq!((r.epoch, r.newest_seq, r.received), (EPOCH, 5, 1));
     assert_eq!((r.loss_runs, r.longest_loss_run), (1, 4));

@@ -116,7 +116,9 @@ fn telemetry_acknowledges_and_a_new_engagement_starts_at_zero() {
         bench.drain();
         let frontier = |d: &RobotDatagram| match d {
             RobotDatagram::Telemetry(t) => Some(t.path_frontier),
-            RobotDatagram::Ping { .. } | RobotDatagram::Reception(_) => None,
+            RobotDatagram::Ping { .. } | RobotDatagram::Reception(_) | RobotDatagram::Servo(_) => {
+                None
+            }
         };
         bench.datagrams.iter().find_map(frontier)
     };
