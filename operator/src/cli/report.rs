@@ -255,7 +255,7 @@ pub enum Event {
         samples: u32,
         samples_at_rest: u32,
         glitches: u32,
-        input: Option<Tally>,
+        input: Option<Box<Tally>>,
         messages: u32,
         knots: u32,
         sessions: u32,
@@ -263,7 +263,7 @@ pub enum Event {
         packets_on_wire: u64,
         bytes_session_up: u64,
         bytes_session_down: u64,
-        link: session::Seen,
+        link: Box<session::Seen>,
     },
 }
 
@@ -285,7 +285,7 @@ impl Event {
             samples: summary.counters.samples,
             samples_at_rest: summary.counters.rest_samples,
             glitches: summary.counters.glitches,
-            input: task.tally().cloned(),
+            input: task.tally().cloned().map(Box::new),
             messages: summary.counters.messages,
             knots: summary.counters.knots,
             sessions: summary.sessions,
@@ -293,7 +293,7 @@ impl Event {
             packets_on_wire: motion.packets,
             bytes_session_up: sent.bytes - motion.bytes,
             bytes_session_down: received.bytes,
-            link: summary.seen,
+            link: Box::new(summary.seen),
         }
     }
 
