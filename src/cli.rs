@@ -33,7 +33,7 @@ struct Cli {
 enum Command {
     /// Both daemons as two processes over a shaped link, and what became of the delay.
     Demo(Box<demo::Args>),
-    /// Make demonstrations of raw recordings: skeletons, or tables of a hand's path.
+    /// Make demonstrations of raw recordings: skeletons, tables of a hand's path, or depth frames.
     Import(Box<ingest::Args>),
     /// Learn a skill from a folder of demonstrations and save it.
     Learn(teach::LearnArgs),

@@ -66,6 +66,9 @@ impl Sink {
                 connected.with_context(|| format!("cannot send to {addr}"))?;
                 Ok(Self::Udp(socket))
             }
+            Source::DepthStdin | Source::DepthFolder(_) => {
+                bail!("a recording is sent to - or udp:ADDRESS:PORT; depth frames are an input only")
+            }
         }
     }
 

@@ -7,6 +7,7 @@ pub mod console;
 pub mod daemon;
 mod dating;
 pub mod demonstration;
+pub mod depth;
 pub mod dial;
 pub mod ingest;
 pub mod input;

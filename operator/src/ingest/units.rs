@@ -16,6 +16,8 @@ pub enum Format {
     Kinect,
     /// A table with a sample a line.
     Csv,
+    /// A folder of depth frames, 16-bit PNG.
+    Depth,
 }
 
 /// A unit of length.
@@ -180,7 +182,7 @@ macro_rules! words {
     };
 }
 
-words!(Format, "kard" => Kard, "kinect" => Kinect, "csv" => Csv);
+words!(Format, "kard" => Kard, "kinect" => Kinect, "csv" => Csv, "depth" => Depth);
 words!(LengthUnit, "m" => M, "cm" => Cm, "mm" => Mm);
 words!(TimeUnit, "s" => S, "ms" => Ms, "us" => Us, "ns" => Ns);
 

@@ -1,14 +1,13 @@
 //! The clutch over a tracked hand, and what becomes of its samples. Sans-IO: time is an argument.
 
 use std::collections::VecDeque;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 
 use nalgebra::UnitQuaternion;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Refusal, RobotState};
-use tokio::sync::mpsc;
 
+use super::read::Inlet;
 use super::{Arrived, Fault, Frame, Kind, Place, Tally, What};
 use crate::clutch::{Clutch, Phase};
 use crate::dating::Dating;
@@ -33,9 +32,7 @@ pub struct Habits {
 /// any of these the clutch must be let go and pressed anew.
 #[derive(Debug)]
 pub struct Driver {
-    arrived: mpsc::Receiver<Arrived>,
-    /// Frames that found the channel full.
-    overflow: Arc<AtomicU64>,
+    inlet: Inlet,
     habits: Habits,
     dating: Dating,
     newest: Option<Newest>,
@@ -81,7 +78,7 @@ impl Driver {
 
     /// What the source says next; never ends.
     pub async fn hear(&mut self) -> Arrived {
-        match self.arrived.recv().await {
+        match self.inlet.arrived.recv().await {
             Some(arrived) => arrived,
             None => std::future::pending().await,
         }
@@ -315,12 +312,15 @@ impl Driver {
 
     /// Does what is due at `now`; whether the task is over.
     pub fn advise(&mut self, now: Stamp, session: &mut Session) -> bool {
-        let overflow = self.overflow.swap(0, Ordering::Relaxed);
+        let overflow = self.inlet.overflow.swap(0, Ordering::Relaxed);
         if overflow > 0 {
             let why = "they come faster than they can be taken";
             self.dropped(&Fault::new(Kind::Flood, why), overflow);
         }
         self.linked |= session.info().is_some();
+        if session.is_ready() {
+            self.inlet.go = None;
+        }
         if self
             .heard
             .is_some_and(|heard| now.secs_since(heard) >= LOST_S)

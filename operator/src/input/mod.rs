@@ -11,6 +11,7 @@ mod source;
 mod tally;
 #[cfg(test)]
 mod tests;
+mod watch;
 
 use telemime_protocol::time::Stamp;
 

@@ -1,4 +1,4 @@
-//! The threads that read a source: lines and datagrams in, frames out.
+//! What reads a source on a thread of its own: lines and datagrams in, frames out.
 
 use std::io::{self, BufRead, BufReader, Read};
 use std::net::{IpAddr, SocketAddr, UdpSocket};
@@ -11,7 +11,9 @@ use telemime_protocol::time::Stamp;
 use tokio::sync::mpsc;
 
 use super::frame::{self, LONGEST, Units};
-use super::{Arrived, Fault, Kind, Source, What};
+use super::{Arrived, Fault, Kind, Source, What, watch};
+use crate::depth::{Camera, CameraError, Finder, Folder, FolderError, Intrinsics, Size};
+use crate::ingest::{FPS, LengthUnit};
 use crate::session::LOST_S;
 
 /// Frames that wait for the daemon; what is beyond is dropped.
@@ -42,9 +44,63 @@ pub enum OpenError {
         /// The address.
         addr: SocketAddr,
     },
+    /// The frames cannot be read.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
+    /// Frames of a size that none can be.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// Raw frames do not say how large they are.
+    #[error("how large is a depth frame? Give --frame-size WIDTHxHEIGHT")]
+    Size,
     /// No thread.
     #[error("no thread to read the input with: {0}")]
     Thread(io::Error),
+}
+
+/// What is to be read, and what its numbers mean.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Settings {
+    /// The only address of a UDP sender that is heard.
+    pub from: Option<IpAddr>,
+    /// Of lines.
+    pub units: Units,
+    /// Of depth frames.
+    pub depth: Depth,
+}
+
+/// What depth frames are.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Depth {
+    /// Their size, where they do not say it themselves.
+    pub size: Option<Size>,
+    /// The camera's; none, a Kinect's.
+    pub at: Option<Intrinsics>,
+    /// Of a count.
+    pub unit: LengthUnit,
+    /// The person's right hand is on the left.
+    pub mirror: bool,
+    /// Of a folder, Hz.
+    pub fps: f64,
+}
+
+impl Default for Depth {
+    fn default() -> Self {
+        Self {
+            size: None,
+            at: None,
+            unit: LengthUnit::Mm,
+            mirror: false,
+            fps: FPS,
+        }
+    }
+}
+
+impl Depth {
+    fn finder(&self, size: Size) -> Result<Finder, CameraError> {
+        let camera = Camera::new(size, self.at, self.unit.metres(), self.mirror)?;
+        Ok(Finder::new(camera))
+    }
 }
 
 /// The session clock: what stamps arrivals.
@@ -82,6 +138,8 @@ pub struct Inlet {
     pub arrived: mpsc::Receiver<Arrived>,
     /// Frames that were not even decoded, or found no room.
     pub overflow: Arc<AtomicU64>,
+    /// A recording begins when this is dropped: once there is a robot to drive.
+    pub go: Option<std::sync::mpsc::Sender<()>>,
 }
 
 /// A way from a reading thread to the daemon; what goes through is stamped by `now`.
@@ -95,7 +153,12 @@ pub fn channel(now: Now) -> (Outlet, Inlet) {
         tokens: BURST,
         filled: None,
     };
-    (outlet, Inlet { arrived, overflow })
+    let inlet = Inlet {
+        arrived,
+        overflow,
+        go: None,
+    };
+    (outlet, inlet)
 }
 
 impl Outlet {
@@ -114,8 +177,13 @@ impl Outlet {
         true
     }
 
+    /// The time of the session.
+    pub(super) fn now(&self) -> Stamp {
+        (self.now)()
+    }
+
     /// Hands over; whether anybody is there to take it.
-    fn put(&self, at: Stamp, what: What) -> bool {
+    pub(super) fn put(&self, at: Stamp, what: What) -> bool {
         match self.tx.try_send(Arrived { at, what }) {
             Ok(()) => true,
             Err(mpsc::error::TrySendError::Full(_)) => {
@@ -127,7 +195,7 @@ impl Outlet {
     }
 
     fn line(&mut self, line: &[u8], units: &Units) -> bool {
-        let at = (self.now)();
+        let at = self.now();
         if line.trim_ascii().is_empty() || !self.admits(at) {
             return true;
         }
@@ -136,8 +204,8 @@ impl Outlet {
     }
 
     /// Says that there will be no more, however full the way is.
-    fn end(self, why: String) {
-        let at = (self.now)();
+    pub(super) fn end(self, why: String) {
+        let at = self.now();
         // A daemon that is gone need not know.
         let _ = self.tx.blocking_send(Arrived {
             at,
@@ -196,7 +264,7 @@ fn datagrams(socket: &UdpSocket, from: Option<IpAddr>, units: &Units, mut to: Ou
         let Ok((n, peer)) = socket.recv_from(&mut buffer) else {
             continue;
         };
-        let now = (to.now)();
+        let now = to.now();
         let strange = from.is_some_and(|from| from != peer.ip())
             || drives.is_some_and(|(addr, heard)| addr != peer && now.secs_since(heard) < LOST_S);
         let going = if strange {
@@ -217,23 +285,20 @@ fn datagrams(socket: &UdpSocket, from: Option<IpAddr>, units: &Units, mut to: Ou
     }
 }
 
-/// Opens `source` and reads it on a thread of its own. Returns what to take from and how the source is called now; `from` is
-/// the only address of a UDP sender that is heard.
+/// Opens `source` and reads it on a thread of its own. Returns what to take from and how the source is called now.
 ///
 /// # Errors
 /// [`OpenError`].
 pub fn open(
     source: &Source,
-    from: Option<IpAddr>,
-    units: Units,
+    settings: Settings,
     clock: Clock,
 ) -> Result<(Inlet, String), OpenError> {
-    let (to, inlet) = channel(Box::new(move || clock.now()));
-    let (name, read): (String, Box<dyn FnOnce() + Send>) = match source {
-        Source::Stdin => (
-            source.to_string(),
-            Box::new(move || lines(io::stdin(), &units, to)),
-        ),
+    let (to, mut inlet) = channel(Box::new(move || clock.now()));
+    let Settings { from, units, depth } = settings;
+    let mut name = source.to_string();
+    let read: Box<dyn FnOnce() + Send> = match source {
+        Source::Stdin => Box::new(move || lines(io::stdin(), &units, to)),
         Source::Udp(addr) => {
             let addr = *addr;
             if !addr.ip().is_loopback() && from.is_none() {
@@ -241,11 +306,19 @@ pub fn open(
             }
             let bind = |source| OpenError::Bind { addr, source };
             let socket = UdpSocket::bind(addr).map_err(bind)?;
-            let bound = socket.local_addr().map_err(bind)?;
-            (
-                Source::Udp(bound).to_string(),
-                Box::new(move || datagrams(&socket, from, &units, to)),
-            )
+            name = Source::Udp(socket.local_addr().map_err(bind)?).to_string();
+            Box::new(move || datagrams(&socket, from, &units, to))
+        }
+        Source::DepthStdin => {
+            let finder = depth.finder(depth.size.ok_or(OpenError::Size)?)?;
+            Box::new(move || watch::stream(io::stdin(), finder, to))
+        }
+        Source::DepthFolder(path) => {
+            let folder = Folder::open(path)?;
+            let finder = depth.finder(folder.size())?;
+            let (go, begin) = std::sync::mpsc::channel();
+            inlet.go = Some(go);
+            Box::new(move || watch::folder(&folder, finder, depth.fps, &begin, to))
         }
     };
     // Never joined: a blocking read cannot be cancelled, and ends with the process.

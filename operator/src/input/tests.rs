@@ -1,11 +1,9 @@
 use std::io::Cursor;
-use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use nalgebra::Vector3;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, Refusal, RobotState};
-use tokio::sync::mpsc;
 
 use super::read::{channel, lines};
 use super::*;
@@ -133,7 +131,7 @@ fn a_flood_is_not_even_decoded_and_its_end_is_told() {
     assert_eq!((taken, inlet.overflow.load(Ordering::Relaxed)), (250, 750));
     assert!(matches!(end, Some(What::End(_))), "{end:?}");
     // What the threads did not decode, the driver counts and tells once.
-    let mut driver = Driver::new(inlet.arrived, inlet.overflow, Habits::default());
+    let mut driver = Driver::new(inlet, Habits::default());
     driver.advise(at(0), &mut ready());
     assert_eq!(driver.tally().of(Kind::Flood), 750);
     assert!(driver.poll_note().unwrap().contains("faster"));
@@ -152,8 +150,8 @@ struct Bench {
 
 impl Bench {
     fn new(habits: Habits) -> Self {
-        let (_, arrived) = mpsc::channel(1);
-        let mut driver = Driver::new(arrived, Arc::default(), habits);
+        let (_, inlet) = channel(Box::new(|| at(0)));
+        let mut driver = Driver::new(inlet, habits);
         driver.on_event(at(0), &Event::Ready);
         Self {
             driver,
