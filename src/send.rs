@@ -67,7 +67,9 @@ impl Sink {
                 Ok(Self::Udp(socket))
             }
             Source::DepthStdin | Source::DepthFolder(_) => {
-                bail!("a recording is sent to - or udp:ADDRESS:PORT; depth frames are an input only")
+                bail!(
+                    "a recording is sent to - or udp:ADDRESS:PORT; depth frames are an input only"
+                )
             }
         }
     }

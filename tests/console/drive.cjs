@@ -222,6 +222,24 @@ async function main(browser, url) {
   await page.click("#reset");
   await person.state("Ready");
 
+  step("Stop acts when it is pressed, and one without a connection is said as soon as there is one");
+  await page.hover("#stop");
+  await page.mouse.down();
+  await person.state("Stopped");
+  await page.mouse.move(500, 300);
+  await page.mouse.up();
+  await page.click("#reset");
+  await person.state("Ready");
+  await page.evaluate(() => {
+    telemime.link.socket.close();
+    document.dispatchEvent(new KeyboardEvent("keydown", { key: "Escape", bubbles: true }));
+  });
+  await page.waitForFunction(() => document.getElementById("log").textContent.includes("no connection to the operator"), null, SOON);
+  await other.state("Stopped");
+  await person.state("Stopped");
+  await page.click("#reset");
+  await person.state("Ready");
+
   step("a page that dies while it drives has let go");
   await person.grab();
   await other.state("Engaged");

@@ -8,7 +8,7 @@ use rustix::process::Signal;
 use crate::processes::{Process, Stage, alone};
 
 /// An operator that follows `input`.
-fn operator(stage: &Stage, addr: &str, input: &[&str]) -> Process {
+pub(crate) fn operator(stage: &Stage, addr: &str, input: &[&str]) -> Process {
     let config = format!(
         "connect = {addr:?}\nidentity = {:?}\npeer = {:?}\nlearn = [{:?}]\npatience_s = 5.0\n",
         stage.text("operator.key"),

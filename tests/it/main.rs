@@ -12,6 +12,7 @@ mod codec;
 mod commands;
 mod correct;
 mod data;
+mod depth;
 mod driver;
 mod evaluate;
 mod floods;

@@ -2,14 +2,12 @@
 
 use std::io;
 use std::net::{SocketAddr, TcpListener};
-use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::Router;
-use axum::body::Body;
+use axum::body::{Body, Bytes};
 use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade};
 use axum::extract::{Path, Request, State};
 use axum::http::header::{self, HeaderMap, HeaderValue};
@@ -17,14 +15,14 @@ use axum::http::{StatusCode, Uri};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use axum::serve::Listener;
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
 use serde::Serialize;
 use telemime_protocol::wire::arm::WireArm;
-use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::TcpStream;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::{Semaphore, mpsc};
 use tokio::time::{Instant, sleep_until, timeout};
 
 use super::command::MAX_COMMAND_LEN;
@@ -43,6 +41,15 @@ const FRAME: Duration = Duration::from_millis(25);
 
 /// A page that takes nothing for this long is left.
 const STALLED: Duration = Duration::from_secs(5);
+
+/// A connection has this long for each request, the pause before it included.
+const REQUEST: Duration = Duration::from_secs(5);
+
+/// A page is asked whether it is still there this often …
+const PING: Duration = Duration::from_secs(5);
+
+/// … and has gone if nothing came from it for this long.
+const GONE: Duration = Duration::from_secs(15);
 
 /// A page that is left gets this long to hear why.
 const FAREWELL: Duration = Duration::from_secs(1);
@@ -110,11 +117,7 @@ pub fn serve(addr: SocketAddr, random: [u8; 16], port: Port) -> Result<String, S
         .spawn(move || {
             runtime.block_on(async {
                 if let Ok(listener) = tokio::net::TcpListener::from_std(listener) {
-                    let listener = Few {
-                        listener,
-                        places: Arc::new(Semaphore::new(MAX_CONNECTIONS)),
-                    };
-                    let _ = axum::serve(listener, router(shared)).await;
+                    accept(&listener, &router(shared)).await;
                 }
             });
         })?;
@@ -167,10 +170,11 @@ fn text(headers: &HeaderMap, name: header::HeaderName) -> Option<&str> {
     headers.get(name).map(|value| value.to_str().unwrap_or("?"))
 }
 
-/// The token becomes a cookie, so that it does not stay in the address bar and the history.
+/// The token becomes a cookie, so that it does not stay in the address bar and the history. Lax, or whoever follows the
+/// address from a message would be asked again; that the socket is opened by our own page is the Origin's to show.
 fn welcomed(guard: &Guard, uri: &Uri) -> Response {
     let cookie = guard.cookie().unwrap_or_default();
-    let cookie = format!("{cookie}; HttpOnly; SameSite=Strict; Path=/");
+    let cookie = format!("{cookie}; HttpOnly; SameSite=Lax; Path=/");
     let headers = [
         (header::SET_COOKIE, cookie),
         (header::LOCATION, uri.path().to_owned()),
@@ -253,9 +257,23 @@ async fn tell(
     let mut snapshots = shared.port.snapshots.clone();
     snapshots.mark_changed();
     let mut told: Option<Arc<WireArm>> = None;
+    let mut ping = Instant::now() + PING;
     loop {
-        snapshots.changed().await.ok()?;
+        let shown = tokio::select! {
+            shown = snapshots.changed() => Some(shown.ok()?),
+            () = sleep_until(ping) => None,
+        };
         let begun = Instant::now();
+        if begun >= ping {
+            ping = begun + PING;
+            match timeout(STALLED, out.send(Message::Ping(Bytes::new()))).await {
+                Ok(Ok(())) => {}
+                _ => return None,
+            }
+        }
+        if shown.is_none() {
+            continue;
+        }
         let snapshot = Arc::clone(&snapshots.borrow_and_update());
         let built = snapshot.built.as_ref();
         let fresh =
@@ -288,7 +306,7 @@ async fn listen(
 ) -> Option<String> {
     let (mut second, mut count, mut wrong) = (Instant::now(), 0, 0);
     loop {
-        let message = match heard.next().await {
+        let message = match timeout(GONE, heard.next()).await.ok()? {
             Some(Ok(message)) => message,
             // Too long, or not a WebSocket any more.
             Some(Err(e)) => return Some(e.to_string().chars().take(100).collect()),
@@ -308,6 +326,10 @@ async fn listen(
             Message::Binary(_) => Command::parse(""),
         };
         match command {
+            // A stop waits for its place, and only its own page with it.
+            Ok(command @ Command::Stop {}) => {
+                drop(commands.send((number, Said::Command(command))).await);
+            }
             // Full: the daemon is behind, and what it does not hear is not obeyed.
             Ok(command) => drop(commands.try_send((number, Said::Command(command)))),
             Err(why) => {
@@ -322,66 +344,26 @@ async fn listen(
     }
 }
 
-/// A listener of a bounded number of connections.
-struct Few {
-    listener: tokio::net::TcpListener,
-    places: Arc<Semaphore>,
-}
-
-impl Listener for Few {
-    type Io = Placed;
-    type Addr = SocketAddr;
-
-    async fn accept(&mut self) -> (Placed, SocketAddr) {
-        loop {
-            let place = Arc::clone(&self.places).acquire_owned().await;
-            match (place, self.listener.accept().await) {
-                (Ok(place), Ok((stream, addr))) => {
-                    let _ = stream.set_nodelay(true);
-                    let _place = place;
-                    return (Placed { stream, _place }, addr);
-                }
-                // Too many files are open, or the peer is gone: the next, in a moment.
-                _ => sleep_until(Instant::now() + FRAME).await,
-            }
-        }
-    }
-
-    fn local_addr(&self) -> io::Result<SocketAddr> {
-        self.listener.local_addr()
-    }
-}
-
-/// A connection and its place.
-struct Placed {
-    stream: TcpStream,
-    _place: OwnedSemaphorePermit,
-}
-
-impl AsyncRead for Placed {
-    fn poll_read(
-        mut self: Pin<&mut Self>,
-        cx: &mut Context<'_>,
-        buf: &mut ReadBuf<'_>,
-    ) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_read(cx, buf)
-    }
-}
-
-impl AsyncWrite for Placed {
-    fn poll_write(
-        mut self: Pin<&mut Self>,
-        cx: &mut Context<'_>,
-        buf: &[u8],
-    ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write(cx, buf)
-    }
-
-    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(cx)
-    }
-
-    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(cx)
+/// A bounded number of connections, and none that only stands there.
+async fn accept(listener: &tokio::net::TcpListener, router: &Router) {
+    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    loop {
+        let place = Arc::clone(&places).acquire_owned().await;
+        let (Ok(place), Ok((stream, _))) = (place, listener.accept().await) else {
+            // Too many files are open, or the peer is gone: the next, in a moment.
+            sleep_until(Instant::now() + FRAME).await;
+            continue;
+        };
+        let _ = stream.set_nodelay(true);
+        let service = TowerToHyperService::new(router.clone());
+        tokio::spawn(async move {
+            let connection = http1::Builder::new()
+                .timer(TokioTimer::new())
+                .header_read_timeout(REQUEST)
+                .serve_connection(TokioIo::new(stream), service)
+                .with_upgrades();
+            let _ = connection.await;
+            drop(place);
+        });
     }
 }

@@ -33,7 +33,9 @@ impl FromStr for Size {
             if (SMALLEST..=LARGEST).contains(&side) {
                 Ok(side)
             } else {
-                Err(format!("`{text}`: a side has {SMALLEST} to {LARGEST} pixels"))
+                Err(format!(
+                    "`{text}`: a side has {SMALLEST} to {LARGEST} pixels"
+                ))
             }
         };
         Ok(Self {
@@ -57,7 +59,9 @@ impl FromStr for Intrinsics {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let wrong = || {
-            format!("`{text}`: write FX,FY,CX,CY in pixels, the focal lengths above 1, as 571,571,320,240")
+            format!(
+                "`{text}`: write FX,FY,CX,CY in pixels, the focal lengths above 1, as 571,571,320,240"
+            )
         };
         let numbers: Result<Vec<f64>, _> = text.split(',').map(|n| n.trim().parse()).collect();
         match numbers.map_err(|_| wrong())?[..] {
@@ -161,7 +165,14 @@ mod tests {
         for bad in ["", "640", "640x", "x480", "16x16", "640x99999", "-640x480"] {
             assert!(bad.parse::<Size>().is_err(), "{bad}");
         }
-        for bad in ["", "571", "571,571,320", "0,571,320,240", "nan,571,320,240", "571,571,inf,240"] {
+        for bad in [
+            "",
+            "571",
+            "571,571,320",
+            "0,571,320,240",
+            "nan,571,320,240",
+            "571,571,inf,240",
+        ] {
             assert!(bad.parse::<Intrinsics>().is_err(), "{bad}");
         }
         let size = "640x480".parse().unwrap();

@@ -144,7 +144,9 @@ fn read(path: &Path) -> Result<(Size, Vec<u16>), FolderError> {
         path: path.to_owned(),
         source,
     })?;
-    let mut reader = Decoder::new(BufReader::new(file)).read_info().map_err(png)?;
+    let mut reader = Decoder::new(BufReader::new(file))
+        .read_info()
+        .map_err(png)?;
     let found = reader.output_color_type();
     if found != (ColorType::Grayscale, BitDepth::Sixteen) {
         let (colour, bits) = found;
@@ -186,7 +188,12 @@ mod tests {
         let open = || Folder::open(dir.path());
         assert!(open().unwrap_err().to_string().contains("no .png"));
         let depth = |name: &str, size| {
-            write(&dir.path().join(name), size, ColorType::Grayscale, BitDepth::Sixteen);
+            write(
+                &dir.path().join(name),
+                size,
+                ColorType::Grayscale,
+                BitDepth::Sixteen,
+            );
         };
         depth("depth_10.png", (40, 36));
         depth("depth_9.png", (40, 32));
@@ -194,10 +201,21 @@ mod tests {
         assert_eq!((folder.len(), folder.size().height), (2, 32));
         assert_eq!(folder.frame(0).unwrap()[..2], [0x0001, 0x0203]);
         let error = folder.frame(1).unwrap_err().to_string();
-        assert!(error.contains("depth_10.png") && error.contains("40 × 36"), "{error}");
-        write(&dir.path().join("1.png"), (32, 32), ColorType::Grayscale, BitDepth::Eight);
+        assert!(
+            error.contains("depth_10.png") && error.contains("40 × 36"),
+            "{error}"
+        );
+        write(
+            &dir.path().join("1.png"),
+            (32, 32),
+            ColorType::Grayscale,
+            BitDepth::Eight,
+        );
         let error = open().unwrap_err().to_string();
-        assert!(error.contains("1.png") && error.contains("16 bits"), "{error}");
+        assert!(
+            error.contains("1.png") && error.contains("16 bits"),
+            "{error}"
+        );
         fs::write(dir.path().join("0.png"), b"not a picture").unwrap();
         assert!(matches!(open().unwrap_err(), FolderError::Png { .. }));
     }

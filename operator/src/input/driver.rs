@@ -332,6 +332,10 @@ impl Driver {
         {
             clutch.ask(now, session);
         }
+        // Whatever took the clutch out of the hand: what nobody holds is not driven.
+        if self.clutch.is_none() && session.is_driving() {
+            session.release();
+        }
         self.is_over(now)
     }
 

@@ -70,6 +70,9 @@ impl Session {
                 if let (Refusal::Diverged, Activity::Mirror(mirror)) = (reason, &mut self.activity)
                 {
                     mirror.go_without_model();
+                } else if self.is_granted() {
+                    // Something else was declined: what the robot follows is not left to its lease.
+                    self.release();
                 } else {
                     self.end_activity();
                     // What was sent for nothing is not what following took.
@@ -177,7 +180,9 @@ impl Session {
             // The robot let go by itself: the clutch must be pressed again. What has not been granted yet it cannot have
             // let go of: then it says how the last session left it.
             RobotState::Holding if self.is_granted() => self.end_activity(),
-            RobotState::Ready if cause == Cause::PlanFinished => self.end_activity(),
+            RobotState::Ready if cause == Cause::PlanFinished && self.is_granted() => {
+                self.end_activity();
+            }
             _ => {}
         }
         self.events.push_back(Event::State(state, cause));

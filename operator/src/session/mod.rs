@@ -413,6 +413,11 @@ impl Session {
         }
     }
 
+    /// Whether anything is driven, or asked for and not declined yet.
+    pub fn is_driving(&self) -> bool {
+        !matches!(self.activity, Activity::Nothing)
+    }
+
     /// Emergency stop: on the stream, and by datagram until the robot says it has stopped.
     pub fn stop(&mut self, now: Stamp) {
         self.end_activity();

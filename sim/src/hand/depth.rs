@@ -76,7 +76,10 @@ impl Scene {
         }
         if let Some(behind_m) = self.wall_m {
             let wall_m = self.chest_m[2] + behind_m;
-            depths.iter_mut().filter(|d| **d == 0.0).for_each(|d| *d = wall_m);
+            depths
+                .iter_mut()
+                .filter(|d| **d == 0.0)
+                .for_each(|d| *d = wall_m);
         }
         if self.errs {
             self.err(&mut depths, &mut stream(seed ^ DEPTH_STREAM, index.into()));

@@ -20,7 +20,7 @@ use tokio::sync::{mpsc, watch};
 use hold::Hold;
 
 use super::snapshot::Seen;
-use super::{Command, Shape, Snapshot};
+use super::{Command, Holding, Shape, Snapshot};
 use crate::clutch::Phase;
 use crate::demonstration::{Demonstration, Sample};
 use crate::recognise::{Recogniser, Verdict};
@@ -239,6 +239,11 @@ impl Live {
                 self.note("emergency stop");
                 return Ok(Some(Act::Stop));
             }
+            Command::Predict { .. } | Command::Discard {} | Command::Use { .. }
+                if self.hold.is_some() && !holds =>
+            {
+                return Err("another page holds the clutch".into());
+            }
             Command::Predict { gain } => {
                 self.gain = gain;
                 if let Some(session) = session {
@@ -321,12 +326,19 @@ impl Live {
             Event::Refused(reason) => self.declined(now, *reason),
             Event::State(state, cause) => {
                 self.state = (*state, *cause);
-                let finished = *cause == Cause::PlanFinished;
-                if let RobotState::Holding | RobotState::Stopped = state {
-                    self.drop_hold();
-                } else if *state == RobotState::Ready && finished {
-                    self.drop_hold();
-                    self.note("played to its end");
+                let follows = self
+                    .hold
+                    .as_ref()
+                    .is_some_and(|hold| hold.phase == Phase::Following);
+                match state {
+                    RobotState::Stopped => self.drop_hold(),
+                    // What has not been granted yet the robot cannot have let go of.
+                    RobotState::Holding if follows => self.drop_hold(),
+                    RobotState::Ready if follows && *cause == Cause::PlanFinished => {
+                        self.drop_hold();
+                        self.note("played to its end");
+                    }
+                    _ => {}
                 }
             }
             Event::Recognised {
@@ -381,6 +393,11 @@ impl Live {
                 self.ask(now, session);
             }
             _ => {}
+        }
+        // Whatever took the clutch out of the hand: what nobody holds is not driven.
+        let driven = |hold: &Hold| hold.what != Holding::Record;
+        if session.is_driving() && !self.hold.as_ref().is_some_and(driven) {
+            session.release();
         }
         if now >= self.next {
             self.next = now.offset_by_secs(SNAPSHOT_S);

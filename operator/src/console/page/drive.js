@@ -20,6 +20,7 @@ export class Drive extends EventTarget {
     this.what = null;
     this.granted = false;
     this.recording = false;
+    this.owed = false;
     this.said = 0;
     this.keys = new Set();
     this.pointers = new Map();
@@ -27,7 +28,10 @@ export class Drive extends EventTarget {
     this.pointing();
     this.typing();
     link.addEventListener("now", (event) => this.heard(event.detail));
-    link.addEventListener("link", () => this.lost());
+    link.addEventListener("link", ({ detail }) => {
+      this.lost();
+      if (detail.open && this.owed) this.stop();
+    });
     const away = () => this.end();
     addEventListener("blur", away);
     addEventListener("pagehide", away);
@@ -56,8 +60,10 @@ export class Drive extends EventTarget {
     this.lost();
   }
 
+  /** The emergency stop; without a connection, as soon as there is one. */
   stop() {
-    this.link.say({ do: "stop" });
+    this.owed = !this.link.say({ do: "stop" });
+    if (this.owed) this.dispatchEvent(new Event("owed"));
     this.end();
   }
 
@@ -70,7 +76,7 @@ export class Drive extends EventTarget {
   heard({ you }) {
     if (!this.what) return;
     // Whoever let go at the other end, the clutch must be pressed anew.
-    if (this.granted && you !== true) this.lost();
+    if (this.granted && you !== true) this.end();
     this.granted ||= you === true;
     // Refused: the log says why.
     if (!this.granted && performance.now() - this.begun > 1500) this.lost();

@@ -61,7 +61,7 @@ export class Fitts extends EventTarget {
       this.tell("Done. The table and the CSV have the result.");
       return;
     }
-    Object.assign(run, { gain, order: order(), at: 0, trials: [], lit_t: null, rest: [], reports: [] });
+    Object.assign(run, { gain, order: order(), at: 0, from: null, broken: false, trials: [], lit_t: null, rest: [], reports: [] });
     this.link.say({ do: "predict", gain });
     this.tell(`Prediction ${gain ? "on" : "off"}: bring the tip into the lit circle.`);
   }
@@ -92,7 +92,8 @@ export class Fitts extends EventTarget {
     const { run } = this;
     if (!run) return;
     if (!engaged) {
-      // A movement that was interrupted is no movement: it begins again.
+      // A movement that was interrupted is none: what is left of it says nothing.
+      run.broken = true;
       run.lit_t = null;
       run.rest = [];
       return;
@@ -115,11 +116,13 @@ export class Fitts extends EventTarget {
     const { run } = this;
     const [{ t }] = run.rest;
     const end = scale(run.rest.reduce((sum, r) => add(sum, r.p), [0, 0, 0]), 1 / run.rest.length);
-    // The way to the first target began anywhere: it does not count.
-    if (run.at > 0) {
-      const from = run.places[run.order[run.at - 1]];
+    // The way to the first target began anywhere, and one after an interruption did: neither counts.
+    const from = run.from;
+    if (from && !run.broken) {
       run.trials.push({ from, to: run.places[run.order[run.at]], end, time_s: Math.max(0.001, (t - run.lit_t) / 1000) });
     }
+    run.from = end;
+    run.broken = false;
     run.at += 1;
     run.lit_t = now;
     run.rest = [];

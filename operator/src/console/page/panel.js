@@ -23,13 +23,16 @@ export class Panel {
     link.addEventListener("link", (event) => this.onLink(event.detail));
     link.addEventListener("now", (event) => this.onNow(event.detail));
     drive.addEventListener("change", () => this.pressed());
+    drive.addEventListener("owed", () => this.log("no connection to the operator: the emergency stop is said as soon as there is one"));
   }
 
   buttons() {
     const { link, drive } = this;
     drive.button($("hold"), () => drive.begin("hand"));
     drive.button($("play"), () => drive.begin("play", $("skills").value));
-    $("stop").addEventListener("click", () => drive.stop());
+    // At once, wherever the finger goes then; a click that no pointer made is a key's or a screen reader's.
+    $("stop").addEventListener("pointerdown", () => drive.stop());
+    $("stop").addEventListener("click", (event) => event.detail === 0 && drive.stop());
     $("reset").addEventListener("click", () => link.say({ do: "reset" }));
     $("predict").addEventListener("change", (event) => {
       this.switched = performance.now();

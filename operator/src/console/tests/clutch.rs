@@ -1,6 +1,10 @@
 //! The clutch of the page, on a clock of our own.
 
-use nalgebra::UnitQuaternion;
+use std::sync::Arc;
+
+use nalgebra::{UnitQuaternion, Vector3};
+use telemime_protocol::checkpoint::select;
+use telemime_protocol::skill::example;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::turn::WireRotation;
@@ -8,11 +12,20 @@ use telemime_protocol::wire::v1::{
     Cause, Info, Message, OperatorControl, OperatorDatagram, Refusal, RobotControl, RobotState,
 };
 
-use super::super::live::LEASE_S;
+use super::super::live::{Known, LEASE_S};
 use super::super::{Act, Command, Holding, Live, Port, Said, seat};
 use crate::session::{Output, Session, SessionConfig};
 
 const MS: i64 = 1_000_000;
+
+/// A skill whose motion is a metre straight on.
+fn straight() -> Known {
+    let x = [Vector3::zeros(), Vector3::x() * 0.5, Vector3::x()];
+    Known {
+        skill: Arc::new(example(2, 24)),
+        plan: Some(select::bounded(&[0.0, 1.0, 2.0], &x, 0.01).unwrap().into()),
+    }
+}
 
 struct Bench {
     live: Live,
@@ -25,7 +38,11 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        let (live, port) = seat(UnitQuaternion::identity(), 1.0, Vec::new(), None);
+        Self::knowing(Vec::new())
+    }
+
+    fn knowing(known: Vec<Known>) -> Self {
+        let (live, port) = seat(UnitQuaternion::identity(), 1.0, known, None);
         let config = SessionConfig {
             scale: Some(0.5),
             ..SessionConfig::default()
@@ -255,6 +272,51 @@ fn what_the_robot_let_go_is_not_taken_up_again() {
         assert_eq!(bench.engages(), 1, "{state:?}");
         assert_eq!(bench.port.snapshots.borrow().holder, None);
     }
+}
+
+/// The state in which the last session left the robot comes after a request: it ends nothing, and whatever does end it ends it
+/// at both ends.
+#[test]
+fn what_is_asked_for_before_the_robot_says_that_it_holds_is_still_let_go() {
+    for what in [Holding::Hand, Holding::Play] {
+        let mut bench = Bench::knowing(vec![straight()]);
+        bench.holds(1, what);
+        bench.state(RobotState::Holding, Cause::ConnectionLost);
+        if what == Holding::Play {
+            bench.hears(&RobotControl::PlanStored { id: 1 });
+        }
+        bench.granted(1);
+        assert_eq!((bench.engages(), bench.releases()), (1, 0), "{what:?}");
+        bench.says(1, Command::Release {});
+        assert_eq!(bench.releases(), 1, "{what:?}");
+        assert!(!bench.session.is_driving());
+    }
+}
+
+#[test]
+fn what_is_declined_while_the_robot_follows_is_let_go_at_both_ends() {
+    let mut bench = driving();
+    let reason = Refusal::BadModel;
+    bench.hears(&RobotControl::Refused { reason });
+    assert_eq!(bench.releases(), 1);
+    assert!(!bench.session.is_driving());
+}
+
+#[test]
+fn who_only_watches_does_not_change_what_is_driven() {
+    let mut bench = driving();
+    let others = [
+        Command::Predict { gain: 0.0 },
+        Command::Discard {},
+        Command::Use {
+            skill: "line".into(),
+        },
+    ];
+    for command in others {
+        bench.says(2, command);
+    }
+    assert_eq!(bench.live.refused(), 3);
+    assert!(bench.last_note().contains("another page"));
 }
 
 #[test]

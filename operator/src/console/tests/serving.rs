@@ -18,7 +18,11 @@ struct Served {
 }
 
 fn served(addr: &str) -> Served {
-    let (commands, heard) = mpsc::channel(64);
+    served_with_room(addr, 64)
+}
+
+fn served_with_room(addr: &str, room: usize) -> Served {
+    let (commands, heard) = mpsc::channel(room);
     let (snapshots, shown) = watch::channel(Arc::default());
     let port = Port {
         commands,
@@ -189,7 +193,7 @@ fn beyond_loopback_nobody_gets_in_without_the_token() {
         .lines()
         .find_map(|line| line.strip_prefix("set-cookie: "))
         .unwrap();
-    assert!(cookie.contains("HttpOnly") && cookie.contains("SameSite=Strict"));
+    assert!(cookie.contains("HttpOnly") && cookie.contains("SameSite=Lax"));
     let cookie = cookie.split(';').next().unwrap();
     let headers = format!("{}Cookie: {cookie}\r\n", served.host());
     assert!(served.get("/", &headers).starts_with("HTTP/1.1 200"));
@@ -274,6 +278,29 @@ fn a_page_that_stalls_loses_snapshots_and_holds_up_nothing() {
         seen += 1;
     }
     assert!(seen < many / 4, "{seen} of {many} were kept for it");
+}
+
+#[test]
+fn a_stop_waits_for_its_place_where_all_else_is_lost() {
+    let mut served = served_with_room("127.0.0.1:0", 1);
+    let mut page = served.page();
+    for _ in 0..5 {
+        say(&mut page, r#"{"do":"alive"}"#);
+    }
+    say(&mut page, r#"{"do":"stop"}"#);
+    let mut said = std::iter::from_fn(|| served.commands.blocking_recv());
+    assert!(
+        said.any(|(_, said)| said == Said::Command(Command::Stop {})),
+        "the page is still there, so this ends with the stop"
+    );
+}
+
+#[test]
+fn who_connects_and_asks_for_nothing_keeps_nobody_out() {
+    let served = served("127.0.0.1:0");
+    let idle: Vec<_> = (0..64).map(|_| served.connect()).collect();
+    assert!(served.get("/", &served.host()).starts_with("HTTP/1.1 200"));
+    drop(idle);
 }
 
 #[test]
