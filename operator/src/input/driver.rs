@@ -57,11 +57,10 @@ struct Newest {
 }
 
 impl Driver {
-    /// Takes what comes through `arrived`; `overflow` counts what did not get in.
-    pub fn new(arrived: mpsc::Receiver<Arrived>, overflow: Arc<AtomicU64>, habits: Habits) -> Self {
+    /// Takes what comes through `inlet`.
+    pub fn new(inlet: Inlet, habits: Habits) -> Self {
         Self {
-            arrived,
-            overflow,
+            inlet,
             habits,
             dating: Dating::new(LOST_S),
             newest: None,

@@ -329,7 +329,7 @@ impl Live {
                 let follows = self
                     .hold
                     .as_ref()
-                    .is_some_and(|hold| hold.phase == Phase::Following);
+                    .is_some_and(|hold| hold.clutch.phase == Phase::Following);
                 match state {
                     RobotState::Stopped => self.drop_hold(),
                     // What has not been granted yet the robot cannot have let go of.
