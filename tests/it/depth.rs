@@ -65,7 +65,11 @@ fn on_real_recordings_the_hand_is_where_the_tracker_has_it_and_never_lost_while_
         let as_numbered = quantile(compared(0), 0.5);
         // Away with certainty: before, at and after the moment, whatever the tracker's lead.
         let rest = joints[0].z;
-        let away = |i: usize| joints[i.saturating_sub(AHEAD)..=i].iter().all(|j| rest - j.z > AWAY_M);
+        let away = |i: usize| {
+            joints[i.saturating_sub(AHEAD)..=i]
+                .iter()
+                .all(|j| rest - j.z > AWAY_M)
+        };
         let (mut frames, mut lost) = (0, 0);
         for (i, found) in found.iter().enumerate().filter(|(i, _)| away(*i)) {
             frames += 1;
@@ -125,9 +129,11 @@ fn through_noise_holes_and_specks_and_before_a_wall_the_hand_is_found() {
             lost += usize::from(nearer_m > 0.3 && found.is_none());
             invented += usize::from(nearer_m < 0.05 && found.is_some());
         }
-        let (median, p95) = (quantile(off.clone(), 0.5), quantile(off, 0.95));
-        println!("{size:?}: {median:.3} m, {p95:.3} m; {lost} of {away} lost");
-        assert!(median < 0.04 && p95 < 0.1, "{size:?}: {median} {p95}");
+        let [median, p90, p95] = [0.5, 0.9, 0.95].map(|share| quantile(off.clone(), share));
+        println!(
+            "{size:?}: median {median:.3} m, p90 {p90:.3} m, p95 {p95:.3} m; {lost} of {away} lost"
+        );
+        assert!(median < 0.03 && p90 < 0.1, "{size:?}: {median} {p90}");
         assert!(away > 20 && lost == 0, "{size:?}: {lost} of {away}");
         assert_eq!(invented, 0, "{size:?}: a hand at rest is none");
     }
@@ -174,21 +180,37 @@ fn a_folder_of_frames_is_imported_and_drives() {
     let frames = folder.to_str().unwrap();
     let out = stage.text("imported");
     let import = Process::start(&[
-        "import", "--format", "depth", frames, "-o", &out, "--json", "--max-gap", "5",
+        "import",
+        "--format",
+        "depth",
+        frames,
+        "-o",
+        &out,
+        "--json",
+        "--max-gap",
+        "5",
     ]);
     let said: serde_json::Value = serde_json::from_str(&import.line().unwrap()).unwrap();
     assert!(import.end().0.success());
     assert_eq!(said["failed"], 0, "{said}");
     let report = &said["files"][0]["report"];
-    assert_eq!((&report["format"], &report["frames"]), (&"depth".into(), &hand.len().into()));
+    assert_eq!(
+        (&report["format"], &report["frames"]),
+        (&"depth".into(), &hand.len().into())
+    );
     let written = said["files"][0]["written"][0].as_str().unwrap();
     let imported = Demonstration::read_csv(Path::new(written)).unwrap();
     let near = |x: &Vector3<f64>| {
         let off = hand.iter().map(|h| (h - x).norm());
         off.fold(f64::INFINITY, f64::min)
     };
-    let worst = imported.samples().iter().map(|s| near(&s.position));
-    assert!(worst.fold(0.0, f64::max) < 0.15);
+    let off: Vec<f64> = imported
+        .samples()
+        .iter()
+        .map(|s| near(&s.position))
+        .collect();
+    let [median, p90] = [0.5, 0.9].map(|share| quantile(off.clone(), share));
+    assert!(median < 0.04 && p90 < 0.12, "{median} {p90}");
 
     let (robot, addr) = stage.robot();
     let input = format!("depth:{frames}");
@@ -202,7 +224,11 @@ fn a_folder_of_frames_is_imported_and_drives() {
     assert_eq!(done["completed"], true, "{done}");
     let samples = done["input"]["samples"].as_u64().unwrap() as usize;
     let untracked = done["input"]["dropped"]["untracked"].as_u64().unwrap_or(0) as usize;
-    assert_eq!(samples + untracked, hand.len(), "every frame is accounted for: {done}");
+    assert_eq!(
+        samples + untracked,
+        hand.len(),
+        "every frame is accounted for: {done}"
+    );
     assert!(done["messages"].as_u64().unwrap() > 10, "{done}");
     assert!(operator.end().0.success());
     robot.signal(Signal::TERM);

@@ -6,8 +6,9 @@
 //!    lies within an arm's length behind it.
 //! 3. What is nearer than the body by [`AWAY_M`] is arm. Its connected pieces are candidates; a temporal gate keeps to the
 //!    one that was followed, else the nearest counts.
-//! 4. Along the surface of the piece, from where it joins the body, the farthest point is the finger tips; the hand is the
-//!    last [`HAND_M`] before it, and its position their centroid, moved by half a hand's thickness away from the camera.
+//! 4. Distances along the surface begin at the middle of the body. What is farthest of a piece, and on from there where the
+//!    forearm goes back again, is the tip of the fingers; the hand is the last [`HAND_M`] before it, and its position their
+//!    centroid, moved by half a hand's thickness away from the camera.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -37,6 +38,21 @@ const STEP_M: f64 = 0.06;
 /// From the tips of the fingers to the wrist, along the surface, m.
 const HAND_M: f64 = 0.18;
 
+/// Surfaces farther behind the body than this are no part of the person, m.
+const BEHIND_M: f64 = 0.35;
+
+/// Distances along the surface begin within this of the middle of the body, m.
+const MIDDLE_M: f64 = 0.1;
+
+/// From where the forearm leaves what is arm for sure, it goes on at most this far, m.
+const FOREARM_M: f64 = 0.4;
+
+/// A hand has no more surface than this, cm².
+const LARGEST_CM2: f64 = 300.0;
+
+/// What of an arm that points at the camera is hand, m.
+const POINTING_M: f64 = 0.12;
+
 /// The palm lies this far behind its surface, m.
 const THICK_M: f64 = 0.02;
 
@@ -64,9 +80,9 @@ pub struct Finder {
     /// Depth of each cell, m; 0 where nothing is seen.
     cells: Vec<f32>,
     thinned: Vec<f32>,
-    /// The piece each cell belongs to, from 1; 0 for none.
-    pieces: Vec<u16>,
-    /// Distance along the surface from the body, m.
+    /// Whether a cell was visited.
+    seen: Vec<bool>,
+    /// Distance along the surface from the middle of the body, m; infinite where there is no way.
     along: Vec<f32>,
     last: Option<(f64, Vector3<f64>)>,
 }
@@ -92,7 +108,7 @@ impl Finder {
             rows,
             cells: vec![0.0; n],
             thinned: vec![0.0; n],
-            pieces: vec![0; n],
+            seen: vec![false; n],
             along: vec![0.0; n],
             last: None,
         }
@@ -119,10 +135,10 @@ impl Finder {
             return None;
         }
         let pieces = self.split(limit_m as f32);
+        self.measure(limit_m as f32, (body_m + BEHIND_M) as f32);
         let hands: Vec<_> = pieces
             .iter()
-            .zip(1..)
-            .filter_map(|(piece, number)| self.hand(piece, number, body_m))
+            .filter_map(|piece| self.hand(piece, body_m))
             .collect();
         let recent = self.last.filter(|(at_s, _)| t_s - at_s <= GATE.1);
         let followed = recent.and_then(|(_, last)| {
@@ -228,90 +244,145 @@ impl Finder {
         Some(f64::from(*median))
     }
 
-    /// Connected pieces nearer than `limit_m`, large enough to be a hand.
+    /// Connected pieces nearer than `limit_m`.
     fn split(&mut self, limit_m: f32) -> Vec<Piece> {
-        self.pieces.fill(0);
-        let mut found: Vec<Piece> = Vec::new();
+        self.seen.fill(false);
+        let mut found = Vec::new();
         for start in 0..self.cells.len() {
-            if !(self.cells[start] > 0.0 && self.cells[start] < limit_m) || self.pieces[start] != 0
-            {
+            let arm = |d: f32| d > 0.0 && d < limit_m;
+            if !arm(self.cells[start]) || self.seen[start] {
                 continue;
             }
-            let number = (found.len() + 1).min(usize::from(u16::MAX)) as u16;
-            let mut piece = Piece {
-                cells: vec![start],
-                nearest_m: f32::INFINITY,
-            };
-            self.pieces[start] = number;
-            let mut next = 0;
-            while let Some(&cell) = piece.cells.get(next) {
-                next += 1;
-                let depth = self.cells[cell];
-                piece.nearest_m = piece.nearest_m.min(depth);
-                for other in around(cell, self.columns) {
-                    let d = self.cells[other];
-                    let joined = (d - depth).abs() <= STEP_M as f32;
-                    if d > 0.0 && d < limit_m && joined && self.pieces[other] == 0 {
-                        self.pieces[other] = number;
-                        piece.cells.push(other);
-                    }
-                }
-            }
-            found.push(piece);
+            let cells = self.grow(start, |this, cell| arm(this.cells[cell]));
+            let nearest = cells.iter().map(|&cell| self.cells[cell]);
+            found.push(Piece {
+                nearest_m: nearest.fold(f32::INFINITY, f32::min),
+                cells,
+            });
         }
         found
     }
 
+    /// The surface around `start` of cells that were not seen yet and belong to it.
+    fn grow(&mut self, start: usize, belongs: impl Fn(&Self, usize) -> bool) -> Vec<usize> {
+        let mut cells = vec![start];
+        self.seen[start] = true;
+        let mut next = 0;
+        while let Some(&cell) = cells.get(next) {
+            next += 1;
+            for other in around(cell, self.columns) {
+                if !self.seen[other] && self.joined(cell, other) && belongs(self, other) {
+                    self.seen[other] = true;
+                    cells.push(other);
+                }
+            }
+        }
+        cells
+    }
+
+    /// Whether two neighbours are of one surface.
+    fn joined(&self, a: usize, b: usize) -> bool {
+        let (a, b) = (self.cells[a], self.cells[b]);
+        b > 0.0 && (b - a).abs() <= STEP_M as f32
+    }
+
     /// The end of an arm; `None` if it is too small to be one.
-    fn hand(&mut self, piece: &Piece, number: u16, body_m: f64) -> Option<Found> {
+    fn hand(&mut self, piece: &Piece, body_m: f64) -> Option<Found> {
         if self.surface_cm2(&piece.cells) < PATCH_CM2 {
             return None;
         }
-        let tip_m = self.measure(piece, number);
-        let is_hand = |cell: &usize| match tip_m {
-            Some(tip) => self.along[*cell] >= tip - HAND_M as f32,
-            // It points at the camera and hides what it hangs on.
-            None => self.cells[*cell] <= piece.nearest_m + 0.12,
-        };
-        let hand: Vec<usize> = piece.cells.iter().copied().filter(is_hand).collect();
+        let along = &self.along;
+        let reached = piece
+            .cells
+            .iter()
+            .copied()
+            .filter(|c| along[*c].is_finite());
+        let farthest = reached.max_by(|a, b| along[*a].total_cmp(&along[*b]));
+        let climbed = farthest.map(|cell| {
+            let tip = self.tip(cell);
+            self.seen.fill(false);
+            let from_m = self.along[tip] - HAND_M as f32;
+            self.grow(tip, |this, cell| {
+                this.along[cell].is_finite() && this.along[cell] >= from_m
+            })
+        });
+        // Where the hand touches the body its surface goes on: then it is what of the arm is before the body.
+        let before = farthest.map(|cell| {
+            let from_m = self.along[cell] - HAND_M as f32;
+            let end = |cell: &usize| self.along[*cell] >= from_m;
+            piece.cells.iter().copied().filter(end).collect::<Vec<_>>()
+        });
+        let mut ends = [climbed, before].into_iter().flatten();
+        let hand = ends.find(|cells| self.surface_cm2(cells) <= LARGEST_CM2);
+        // It points at the camera and hides what it hangs on.
+        let hand = hand.unwrap_or_else(|| {
+            let to_m = piece.nearest_m + POINTING_M as f32;
+            let near = |cell: &usize| self.cells[*cell] <= to_m;
+            piece.cells.iter().copied().filter(near).collect()
+        });
         let sum: Vector3<f64> = hand.iter().map(|&cell| self.point(cell)).sum();
         let surface = sum / hand.len() as f64;
-        let position = surface * (1.0 + THICK_M / surface.norm());
         Some(Found {
-            position,
+            position: surface * (1.0 + THICK_M / surface.norm()),
             area_cm2: self.surface_cm2(&hand),
             away_m: body_m - f64::from(piece.nearest_m),
         })
     }
 
-    /// How far each cell of the piece is from the body along the surface; the largest of it, m. `None` if it joins nothing.
-    fn measure(&mut self, piece: &Piece, number: u16) -> Option<f32> {
+    /// The end of the arm whose farthest cell in front of the body is `cell`: where the forearm goes back, it is farther.
+    fn tip(&mut self, cell: usize) -> usize {
+        let from_m = self.along[cell];
+        self.seen.fill(false);
+        let on = self.grow(cell, |this, cell| {
+            this.along[cell].is_finite() && this.along[cell] >= from_m
+        });
+        let farther = |a: &&usize, b: &&usize| self.along[**a].total_cmp(&self.along[**b]);
+        let tip = on.iter().max_by(farther).copied().unwrap_or(cell);
+        // A way that goes on much farther leads from a hand on the hip down the leg.
+        if self.along[tip] - from_m <= FOREARM_M as f32 {
+            tip
+        } else {
+            cell
+        }
+    }
+
+    /// How far each cell nearer than `to_m` is along the surface from the middle of what is farther than `from_m`.
+    fn measure(&mut self, from_m: f32, to_m: f32) {
+        self.along.fill(f32::INFINITY);
+        let body = (0..self.cells.len()).filter(|c| (from_m..to_m).contains(&self.cells[*c]));
+        let mut body: Vec<usize> = body.collect();
+        if body.is_empty() {
+            return;
+        }
+        let middle = body.len() / 2;
+        // Cells are numbered row by row.
+        let row = body[middle] / self.columns;
+        let columns = self.columns;
+        body.sort_unstable_by_key(|cell| cell % columns);
+        let middle = row * columns + body[middle] % columns;
+        let nearest = body.iter().copied().min_by_key(|&cell| {
+            let (x, y) = (cell % columns, cell / columns);
+            x.abs_diff(middle % columns).pow(2) + y.abs_diff(middle / columns).pow(2)
+        });
+        let Some(centre) = nearest.map(|cell| self.point(cell)) else {
+            return;
+        };
         let mut open = BinaryHeap::new();
-        for &cell in &piece.cells {
-            self.along[cell] = f32::INFINITY;
-            let joins = around(cell, self.columns).any(|other| {
-                let d = self.cells[other];
-                self.pieces[other] != number
-                    && d > 0.0
-                    && (d - self.cells[cell]).abs() <= STEP_M as f32
-            });
-            if joins {
+        for &cell in &body {
+            if (self.point(cell) - centre).norm() <= MIDDLE_M {
                 self.along[cell] = 0.0;
                 open.push((Reverse(0_u32), cell));
             }
         }
-        let mut tip = None;
         // Whole tenths of a millimetre: a heap wants an order.
         while let Some((Reverse(tenths), cell)) = open.pop() {
             let so_far = tenths as f32 * 1e-4;
             if so_far > self.along[cell] + 1e-4 {
                 continue;
             }
-            tip = Some(tip.map_or(so_far, |t: f32| t.max(so_far)));
             let here = self.point(cell);
-            for other in around(cell, self.columns) {
-                let joined = (self.cells[other] - self.cells[cell]).abs() <= STEP_M as f32;
-                if self.pieces[other] != number || !joined {
+            for other in around(cell, columns) {
+                if !self.joined(cell, other) || self.cells[other] >= to_m {
                     continue;
                 }
                 let there = so_far + (self.point(other) - here).norm() as f32;
@@ -321,7 +392,6 @@ impl Finder {
                 }
             }
         }
-        tip
     }
 
     /// Where a cell's surface is, m.
