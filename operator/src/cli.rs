@@ -28,6 +28,7 @@ use crate::daemon::{Daemon, Learning, Reopen};
 use crate::demonstration::{Demonstration, Sample};
 use crate::input::read::Clock;
 use crate::placed::Motion;
+use crate::recording::Scribe;
 use crate::session::Leeway;
 use crate::task::{Outcome, Recording, Task};
 pub use args::{Args, Axes};
@@ -92,7 +93,7 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     let clock = HostClock::new();
     // A second before now, so that a sensor's latency may be subtracted from the first sample.
     let epoch = Mono(clock.now().0 - 1_000_000_000);
-    let (mut task, played) = match &args.input.input {
+    let (task, played) = match &args.input.input {
         Some(source) => (
             args.input
                 .task(source, Clock { host: clock, epoch }, &log)?,
@@ -100,6 +101,14 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         ),
         None => make_task(&args, &skills, config.rotation, &log)?,
     };
+    let scribe = args.record.as_deref().map(|path| {
+        let say = {
+            let log = log.clone();
+            move |outcome| log.say(&Event::recording(&outcome))
+        };
+        Scribe::start(path, config.rotation, say)
+    });
+    let mut task = task.recorded(scribe.transpose()?);
 
     let (quit, words) = cli::listen(args.follow_stdin, cli::OPERATOR_WORDS, || {})?;
     let meter = Meter::default();
@@ -151,6 +160,8 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         log.say(&scores);
     }
     log.say(&Event::done(&summary, &task, epoch, config.input_latency_s));
+    // Its recording says what became of it.
+    drop(task);
     drop(log);
     printing.finish();
     match summary.outcome {

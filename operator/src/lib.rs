@@ -15,6 +15,7 @@ pub mod learn;
 pub mod lessons;
 pub mod placed;
 pub mod recognise;
+pub mod recording;
 pub mod session;
 pub mod skill_file;
 pub mod tap;

@@ -9,6 +9,7 @@ use telemime_protocol::wire::v1::{Cause, Refusal, RobotState};
 use crate::console::{Act, Live, Said};
 use crate::demonstration::Sample;
 use crate::input::{self, Driver};
+use crate::recording::Scribe;
 use crate::session::{Event, HandSample, LOST_S, Leeway, Session};
 
 /// Pause before a declined request is made again, s.
@@ -119,6 +120,7 @@ pub struct Task {
     begun: Option<Stamp>,
     requests: u32,
     trouble: Option<String>,
+    scribe: Option<Scribe>,
 }
 
 impl Task {
@@ -158,6 +160,13 @@ impl Task {
     /// Does what the person at the page does, until it is told to quit.
     pub fn live(live: Live) -> Self {
         Self::new(Work::Live(Box::new(live)))
+    }
+
+    /// The same, recorded.
+    #[must_use]
+    pub fn recorded(mut self, scribe: Option<Scribe>) -> Self {
+        self.scribe = scribe;
+        self
     }
 
     /// The person at the page, if that is the task.
@@ -228,6 +237,7 @@ impl Task {
             begun: None,
             requests: 0,
             trouble: None,
+            scribe: None,
         }
     }
 
@@ -287,6 +297,9 @@ impl Task {
 
     /// The connection was lost: the arm holds, and nothing here engages it again.
     pub fn on_lost(&mut self, why: &str) {
+        if let Some(scribe) = &mut self.scribe {
+            scribe.lost(why);
+        }
         if let Some(live) = self.person() {
             return live.on_lost(why);
         }
@@ -305,6 +318,9 @@ impl Task {
 
     /// The session reports.
     pub fn on_event(&mut self, now: Stamp, event: &Event) {
+        if let Some(scribe) = &mut self.scribe {
+            scribe.hear(now, event);
+        }
         if let Some(live) = self.person() {
             return live.on_event(now, event);
         }
@@ -345,6 +361,9 @@ impl Task {
 
     /// Feeds the session what is due at `now`.
     pub fn advise(&mut self, now: Stamp, session: &mut Session) -> Advice {
+        if let Some(scribe) = &mut self.scribe {
+            scribe.see(now, session);
+        }
         if let Some(live) = self.person() {
             live.advise(now, session);
             return Advice::Continue;

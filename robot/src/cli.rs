@@ -107,7 +107,8 @@ pub struct Args {
     /// Speak protocol versions up to this one; 2 is an experiment [default: 1].
     #[arg(long, value_name = "N")]
     pub protocol_max: Option<u16>,
-    /// Write every tick to this CSV file.
+    /// Record into this new file: NAME.mcap, a recording that Foxglove, Lichtblick and rerun open; any other name, every
+    /// tick as CSV.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
     /// Drive a real arm: this command (run by sh) tells its joints' state and takes setpoints, a JSON line each; docs/driver.md.
@@ -281,12 +282,8 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
             eprintln!("note: {notice}");
         }
     }
-    let recorder = args
-        .record
-        .clone()
-        .or(file.record)
-        .map(|path| TickRecorder::start(&path, rig.arm.dof()))
-        .transpose()?;
+    let record = args.record.clone().or(file.record);
+    let recorder = record::ticks(record.as_deref(), &rig)?;
     let listen = args
         .listen
         .or(file.listen)
@@ -320,6 +317,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         json: args.json,
         out,
     };
+    let scribe = record::scribe(record.as_deref(), &rig, &log)?;
     let keeper = match args.black_box.clone().or(file.black_box) {
         Some(dir) => {
             // Better now than after the stop that it was for.
@@ -395,7 +393,8 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let daemon = daemon
         .with_external(dispersion.map(External::host))
         .showing(rig.described())
-        .with_black_box(asker);
+        .with_black_box(asker)
+        .recorded(scribe);
     let (notices, heard) = mpsc::unbounded_channel();
     let listener = tokio::spawn(listen_to(
         heard,

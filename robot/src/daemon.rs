@@ -21,6 +21,7 @@ use crate::blackbox::Asker;
 use crate::clock::Origin;
 use crate::desk::{Desk, Progress};
 use crate::door::{self, Door, Place, Verdict};
+use crate::recording::Scribe;
 use crate::refused::{Reason, Refused, Tally};
 use crate::servo::thread::{Times, Timing};
 use crate::servo::{ArmFault, Handle, Order, Report};
@@ -76,6 +77,7 @@ pub struct Daemon {
     refused: Tally,
     silent_drains: u32,
     asker: Option<Asker>,
+    scribe: Option<Scribe>,
     fault: Option<ArmFault>,
 }
 
@@ -180,6 +182,7 @@ impl Daemon {
             refused: Tally::default(),
             silent_drains: 0,
             asker: None,
+            scribe: None,
             fault: None,
         }
     }
@@ -202,6 +205,13 @@ impl Daemon {
     #[must_use]
     pub fn with_black_box(mut self, asker: Option<Asker>) -> Self {
         self.asker = asker;
+        self
+    }
+
+    /// The same, recorded.
+    #[must_use]
+    pub fn recorded(mut self, scribe: Option<Scribe>) -> Self {
+        self.scribe = scribe;
         self
     }
 
@@ -445,6 +455,9 @@ impl Daemon {
             at_rest = report.state == RobotState::Stopped && !report.moving;
             if let Some(active) = active.as_deref_mut() {
                 active.session.handle_report(&report, timing);
+            }
+            if let Some(scribe) = &mut self.scribe {
+                scribe.take(&report, active.as_deref().map(|active| &active.session));
             }
             let _ = notices.send(Notice::Report(Box::new(report)));
         }

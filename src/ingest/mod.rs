@@ -1,6 +1,7 @@
 //! `telemime import`: raw recordings to a folder of demonstrations.
 
 mod figure;
+mod recorded;
 mod write;
 
 use std::collections::BTreeMap;
@@ -9,14 +10,16 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use serde_json::json;
 use telemime_endpoint::cli::one_line;
+use telemime_endpoint::recording;
 use telemime_operator::depth::Intrinsics;
 use telemime_operator::ingest::segment::Method;
 use telemime_operator::ingest::{
-    Axes, Columns, Cut, Format, Imported, IngestError, LengthUnit, MAX_GAP_S, Options, Report,
-    TimeUnit, grip_range, import, import_depth,
+    Axes, Columns, Cut, Fault, Format, Imported, IngestError, LengthUnit, MAX_GAP_S, Options,
+    Report, TimeUnit, grip_range, import, import_depth,
 };
 
-/// Make demonstrations of raw recordings: Kinect or OpenNI skeletons, tables of a hand's path, or depth frames.
+/// Make demonstrations of raw recordings: Kinect or OpenNI skeletons, tables of a hand's path, depth frames, or what the
+/// operator daemon recorded (--record), of which every engagement is one.
 ///
 /// Each RAW file is read, cleaned and written to DIR as CSV (t,x,y,z, in s and m; orientation and gripper come along),
 /// so that `telemime learn DIR` can follow at once. What was changed is counted and said. A file that cannot be
@@ -25,9 +28,10 @@ use telemime_operator::ingest::{
 #[command(after_help = "Examples:
   telemime import kard/*.txt --joint right_hand -o wave
   telemime import swings.csv --format kinect --segment -o swing --figure swing.svg
+  telemime import monday.mcap -o screw
   telemime import mocap.tsv --columns t=Time,x=RH_X,y=RH_Y,z=RH_Z --unit mm --axes x,z,-y -o reach")]
 pub(crate) struct Args {
-    /// Raw recordings; of a folder, every .txt, .csv and .tsv in it (depth: the folder is one recording).
+    /// Raw recordings; of a folder, every .txt, .csv, .tsv and .mcap in it (depth: the folder is one recording).
     #[arg(value_name = "RAW", required = true)]
     raw: Vec<PathBuf>,
     /// The folder to write to, made if need be; its name becomes the skill's.
@@ -148,8 +152,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     };
     let mut folder = write::Folder::open(&dir, &raws, args.force)?;
     let mut done: Vec<Done> = Vec::new();
-    for raw in raws {
-        let result = convert(&raw, &options).and_then(|imported| {
+    let open = |raw| match depth {
+        true => vec![(raw, Ok(Vec::new()))],
+        false => opened(raw),
+    };
+    for (raw, bytes) in raws.into_iter().flat_map(open) {
+        let result = bytes.and_then(|bytes| {
+            let imported = convert(&raw, &bytes, &options)?;
             let paths = folder.write(&raw, &imported.takes)?;
             Ok((imported, paths))
         });
@@ -187,15 +196,34 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     }
 }
 
-fn convert(raw: &Path, options: &Options) -> anyhow::Result<Imported> {
-    let read = || match options.format {
+fn convert(raw: &Path, bytes: &[u8], options: &Options) -> anyhow::Result<Imported> {
+    let imported = match options.format {
         Some(Format::Depth) => import_depth(raw, options),
-        _ => import(&std::fs::read(raw)?, options),
+        _ => import(bytes, options),
     };
-    Ok(read().map_err(|fault| IngestError {
+    Ok(imported.map_err(|fault| of(raw, fault))?)
+}
+
+fn of(raw: &Path, fault: impl Into<Fault>) -> IngestError {
+    IngestError {
         path: raw.to_owned(),
-        fault,
-    })?)
+        fault: fault.into(),
+    }
+}
+
+/// A file's bytes; of a recording, every engagement's as a table, under a name of its own.
+fn opened(raw: PathBuf) -> Vec<(PathBuf, anyhow::Result<Vec<u8>>)> {
+    if !recording::is_named(&raw) {
+        let bytes = std::fs::read(&raw).map_err(|e| of(&raw, e).into());
+        return vec![(raw, bytes)];
+    }
+    match recorded::engagements(&raw, |note| eprintln!("note: {note}")) {
+        Ok(all) => all
+            .into_iter()
+            .map(|one| (one.raw, Ok(one.table.into_bytes())))
+            .collect(),
+        Err(e) => vec![(raw, Err(e.into()))],
+    }
 }
 
 /// Files as given; folders by what is in them, unless each is a recording. None twice.
@@ -211,12 +239,15 @@ fn expanded(given: &[PathBuf], folders: bool) -> anyhow::Result<Vec<PathBuf>> {
         for entry in std::fs::read_dir(path).with_context(cannot)? {
             let file = entry.with_context(cannot)?.path();
             let ending = file.extension().and_then(|e| e.to_str()).unwrap_or("");
-            if ["txt", "csv", "tsv"].contains(&ending.to_ascii_lowercase().as_str()) {
+            if ["txt", "csv", "tsv", "mcap"].contains(&ending.to_ascii_lowercase().as_str()) {
                 inside.push(file);
             }
         }
         if inside.is_empty() {
-            bail!("{}: no .txt, .csv or .tsv in this folder", path.display());
+            bail!(
+                "{}: no .txt, .csv, .tsv or .mcap in this folder",
+                path.display()
+            );
         }
         inside.sort();
         all.append(&mut inside);

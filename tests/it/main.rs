@@ -34,6 +34,7 @@ mod prediction;
 mod processes;
 mod protocol;
 mod recognition;
+mod recordings;
 mod recovery;
 mod refinement;
 mod safety;

@@ -46,8 +46,11 @@ fn lines(source: impl std::io::Read + Send + 'static) -> Receiver<String> {
 
 impl Process {
     pub(crate) fn start(args: &[&str]) -> Self {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_telemime"))
-            .args(args)
+        Self::spawn(Command::new(env!("CARGO_BIN_EXE_telemime")).args(args))
+    }
+
+    pub(crate) fn spawn(command: &mut Command) -> Self {
+        let mut child = command
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
@@ -173,6 +176,10 @@ impl Stage {
 
     /// The same with more flags.
     pub(crate) fn robot_with(&self, flags: &[&str]) -> (Process, String) {
+        self.robot_by(Command::new(env!("CARGO_BIN_EXE_telemime")).args(self.robot_args(flags)))
+    }
+
+    pub(crate) fn robot_args(&self, flags: &[&str]) -> Vec<String> {
         let config = format!(
             "listen = \"127.0.0.1:0\"\nidentity = {:?}\npeers = [{:?}]\n",
             self.text("robot.key"),
@@ -181,7 +188,13 @@ impl Stage {
         std::fs::write(self.path("robot.toml"), config).unwrap();
         let config = self.text("robot.toml");
         let first = ["robot", "--config", &config, "--json", "--follow-stdin"];
-        let robot = Process::start(&[&first, flags].concat());
+        let all = [&first, flags].concat();
+        all.into_iter().map(str::to_owned).collect()
+    }
+
+    /// A robot started by `command`, and its address.
+    pub(crate) fn robot_by(&self, command: &mut Command) -> (Process, String) {
+        let robot = Process::spawn(command);
         let listening = robot.event("listening");
         assert_eq!(listening["fingerprint"], self.fingerprint("robot"));
         let addr = listening["addr"].as_str().unwrap().to_owned();
@@ -189,6 +202,11 @@ impl Stage {
     }
 
     pub(crate) fn operator(&self, addr: &str, key: &str) -> Process {
+        self.operator_with(addr, key, &[])
+    }
+
+    /// The same with more flags.
+    pub(crate) fn operator_with(&self, addr: &str, key: &str, flags: &[&str]) -> Process {
         let config = format!(
             "connect = {addr:?}\nidentity = {:?}\npeer = {:?}\nlearn = [{:?}]\nreplay = {:?}\npatience_s = 5.0\n",
             self.text(&format!("{key}.key")),
@@ -197,13 +215,9 @@ impl Stage {
             self.text("unseen.csv"),
         );
         std::fs::write(self.path("operator.toml"), config).unwrap();
-        Process::start(&[
-            "operator",
-            "--config",
-            &self.text("operator.toml"),
-            "--json",
-            "--follow-stdin",
-        ])
+        let config = self.text("operator.toml");
+        let first = ["operator", "--config", &config, "--json", "--follow-stdin"];
+        Process::start(&[&first, flags].concat())
     }
 }
 

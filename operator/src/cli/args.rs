@@ -144,6 +144,10 @@ pub struct Args {
     /// Offer protocol versions up to this one; 2 is an experiment [default: 1].
     #[arg(long, value_name = "N")]
     pub protocol_max: Option<u16>,
+    /// Record the hand, the arm as it is told, and all that is known of the link into this new MCAP file: Foxglove,
+    /// Lichtblick and rerun open it, `telemime import` makes demonstrations of it.
+    #[arg(long, value_name = "FILE.mcap")]
+    pub record: Option<PathBuf>,
     /// Seed of learning.
     #[arg(long)]
     pub seed: Option<u64>,
@@ -297,6 +301,7 @@ struct File {
     rest_s: Option<f64>,
     patience_s: Option<f64>,
     protocol_max: Option<u16>,
+    record: Option<PathBuf>,
     seed: Option<u64>,
 }
 
@@ -377,6 +382,7 @@ impl Args {
         self.rest = self.rest.or(file.rest_s);
         self.patience = self.patience.or(file.patience_s);
         self.protocol_max = self.protocol_max.or(file.protocol_max);
+        self.record = self.record.or(file.record);
         self.seed = self.seed.or(file.seed);
         Ok(self)
     }

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use telemime_endpoint::Mono;
 use telemime_endpoint::cli::Printer;
 use telemime_endpoint::meter::Counts;
+use telemime_endpoint::recording;
 use tokio::sync::mpsc;
 
 use super::played::Played;
@@ -247,6 +248,12 @@ pub enum Event {
     Saved {
         file: PathBuf,
     },
+    Recording {
+        file: PathBuf,
+        messages: u64,
+        dropped: u64,
+        error: Option<String>,
+    },
     Done {
         completed: bool,
         why: Option<String>,
@@ -438,6 +445,12 @@ impl Event {
                     novel.join(", ")
                 )
             }
+            Self::Recording {
+                file,
+                messages,
+                dropped,
+                error,
+            } => recording::told(file, *messages, *dropped, error.as_deref()),
             Self::Saved { file } => format!("saved {}", file.display()),
             Self::Done {
                 samples,
@@ -459,6 +472,18 @@ impl Event {
                 }
             ),
         })
+    }
+}
+
+impl Event {
+    /// What became of a recording.
+    pub(super) fn recording(outcome: &recording::Outcome) -> Self {
+        Self::Recording {
+            file: outcome.path.clone(),
+            messages: outcome.messages,
+            dropped: outcome.dropped,
+            error: outcome.error.as_ref().map(ToString::to_string),
+        }
     }
 }
 

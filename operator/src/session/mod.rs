@@ -81,6 +81,7 @@ pub struct Session {
     hand: Option<Hand>,
     gate: Gate,
     interval: Interval,
+    heard: Option<VecDeque<(Option<u32>, HandSample)>>,
     recogniser: Option<Recogniser>,
     external: Option<ExternalClock>,
     verdict: Option<Verdict>,
@@ -130,6 +131,7 @@ impl Session {
             hand: None,
             gate: Gate::default(),
             interval: Interval::default(),
+            heard: None,
             recogniser: None,
             external: None,
             verdict: None,
@@ -232,6 +234,7 @@ impl Session {
     /// [`Session::let_go`]. Samples out of order or not finite are dropped and counted.
     pub fn handle_sample(&mut self, now: Stamp, mut sample: HandSample) {
         sample.t = sample.t.offset_by_secs(-self.config.input_latency_s);
+        self.listen(&sample);
         if matches!(
             self.activity,
             Activity::Play {

@@ -1,12 +1,17 @@
 //! What a session shows of itself: for display, and to be changed while it drives.
 
+use std::collections::VecDeque;
+
 use nalgebra::Vector3;
 use telemime_protocol::predict::Forecast;
 use telemime_protocol::wire::arm::WireArm;
 
 use super::gate::Gate;
-use super::{Activity, Session};
+use super::{Activity, HandSample, Session};
 use crate::recognise::Recogniser;
+
+/// Samples kept for a listener that is slow: it looks many times a second.
+const MAX_HEARD: usize = 4096;
 
 impl Session {
     /// How the arm is built, if the robot has said so.
@@ -29,6 +34,28 @@ impl Session {
             Activity::Nothing | Activity::Play { .. } => None,
         };
         mirror.into_iter().flat_map(|mirror| mirror.recent_knots())
+    }
+
+    /// The session's epoch.
+    pub fn epoch(&self) -> u32 {
+        self.epoch
+    }
+
+    /// The samples handed over since the last call, as they came, each with the engagement that was asked to follow it; for
+    /// a recording. The first call begins to listen.
+    pub fn heard(&mut self) -> VecDeque<(Option<u32>, HandSample)> {
+        self.heard.replace(VecDeque::new()).unwrap_or_default()
+    }
+
+    pub(super) fn listen(&mut self, sample: &HandSample) {
+        let Some(heard) = &mut self.heard else {
+            return;
+        };
+        if heard.len() == MAX_HEARD {
+            heard.pop_front();
+        }
+        let followed = matches!(self.activity, Activity::Mirror(_));
+        heard.push_back((followed.then_some(self.engagement), *sample));
     }
 
     /// Predicts with this gain κ from now on, clamped to [0, 1]; what is being driven too.

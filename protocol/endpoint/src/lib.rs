@@ -12,6 +12,7 @@ pub mod pairing;
 pub mod peers;
 pub mod quic;
 pub mod reception;
+pub mod recording;
 pub mod tls;
 pub mod trust;
 

@@ -1,4 +1,4 @@
-//! Every tick to a file, off the servo's thread.
+//! Every tick to a file, off the servo's thread; or a recording that viewers open.
 
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -6,10 +6,32 @@ use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 
 use anyhow::{Context, bail};
 
+use telemime_endpoint::recording;
+
+use super::report::Log;
+use crate::recording::Scribe;
+use crate::rig::Rig;
 use crate::servo::Report;
 
 /// Ticks on their way to the disk; a slow disk loses ticks, never the servo's time.
 const QUEUE: usize = 8192;
+
+/// Ticks as CSV, if that is what is wanted.
+pub(super) fn ticks(path: Option<&Path>, rig: &Rig) -> anyhow::Result<Option<TickRecorder>> {
+    let csv = path.filter(|path| !recording::is_named(path));
+    csv.map(|path| TickRecorder::start(path, rig.arm.dof()))
+        .transpose()
+}
+
+/// A recording that viewers open, if that is what is wanted.
+pub(super) fn scribe(path: Option<&Path>, rig: &Rig, log: &Log) -> anyhow::Result<Option<Scribe>> {
+    let Some(path) = path.filter(|path| recording::is_named(path)) else {
+        return Ok(None);
+    };
+    let log = log.clone();
+    let say = move |outcome| log.recording(&outcome);
+    Ok(Some(Scribe::start(path, rig, say)?))
+}
 
 /// Writes ticks to a CSV file from a thread of its own.
 pub(super) struct TickRecorder {
@@ -20,7 +42,7 @@ pub(super) struct TickRecorder {
 }
 
 impl TickRecorder {
-    pub(super) fn start(path: &Path, dof: usize) -> anyhow::Result<Self> {
+    fn start(path: &Path, dof: usize) -> anyhow::Result<Self> {
         let file = std::fs::File::create(path)
             .with_context(|| format!("cannot write {}", path.display()))?;
         let (queue, reports) = sync_channel::<Report>(QUEUE);

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use telemime_endpoint::cli::Printer;
 use telemime_endpoint::pairing::Candidate;
 use telemime_endpoint::reception::{Quantiles, Received};
+use telemime_endpoint::recording::{self, Outcome};
 
 use crate::blackbox::{Due, Saved};
 use crate::desk::Progress;
@@ -44,6 +45,12 @@ pub enum Event {
         up: Received,
         down_delay: Option<Quantiles>,
         age: Option<Quantiles>,
+    },
+    Recording {
+        file: PathBuf,
+        messages: u64,
+        dropped: u64,
+        error: Option<String>,
     },
     Refused {
         reason: String,
@@ -185,6 +192,24 @@ impl Log {
             why,
             file: saved.as_ref().ok().cloned(),
             error: saved.as_ref().err().map(ToString::to_string),
+        };
+        self.say(&event, || text);
+    }
+
+    pub(super) fn recording(&self, outcome: &Outcome) {
+        let Outcome {
+            path,
+            messages,
+            dropped,
+            error,
+        } = outcome;
+        let error = error.as_ref().map(ToString::to_string);
+        let text = recording::told(path, *messages, *dropped, error.as_deref());
+        let event = Event::Recording {
+            file: path.clone(),
+            messages: *messages,
+            dropped: *dropped,
+            error,
         };
         self.say(&event, || text);
     }
