@@ -2,17 +2,18 @@
 
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use telemime_endpoint::admin;
 use telemime_endpoint::cli::one_line;
+use telemime_endpoint::config::{self, CheckArgs};
 use telemime_endpoint::peers::Role;
 use telemime_sim::link::{
     LinkConfig, Loss, Rate, parse_duration_s, parse_probability, parse_rate_bit_s,
 };
 
 use crate::{
-    arm, codec, demo, evaluate, experiment, ingest, link, paper, recognise, replay, select, send,
-    tap, teach,
+    arm, codec, demo, doctor, evaluate, experiment, ingest, link, pages, paper, recognise, replay,
+    select, send, tap, teach,
 };
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
@@ -63,6 +64,13 @@ enum Command {
     Identity(admin::IdentityArgs),
     Pair(telemime_operator::cli::PairArgs),
     Peers(admin::PeersArgs),
+    CheckConfig(CheckConfigArgs),
+    /// Look at this host, and the way to a robot: what is in order, what is not, and what to do.
+    Doctor(doctor::Args),
+    /// Print what a shell needs to complete our commands.
+    Completions(pages::CompletionsArgs),
+    /// Write man pages.
+    Man(pages::ManArgs),
     /// Measure the input's latency from taps on a table.
     Tap(tap::Args),
     /// A plan's runs: both daemons on a virtual clock, and what they are held against.
@@ -73,6 +81,34 @@ enum Command {
     Link(Box<link::Args>),
     /// Reproduce the tables of the source publication beside ours.
     Paper(paper::Args),
+}
+
+#[derive(clap::Args, Debug, Clone)]
+struct CheckConfigArgs {
+    /// Whose configuration it is.
+    #[arg(value_enum)]
+    daemon: admin::End,
+    #[command(flatten)]
+    check: CheckArgs,
+}
+
+impl CheckConfigArgs {
+    fn run(&self) -> anyhow::Result<bool> {
+        let environment = config::environment();
+        match self.daemon {
+            admin::End::Operator => {
+                config::check::<telemime_operator::cli::Args>(&self.check, &environment)
+            }
+            admin::End::Robot => {
+                config::check::<telemime_robot::cli::Args>(&self.check, &environment)
+            }
+        }
+    }
+}
+
+/// The whole command line, for man pages and completions.
+pub(crate) fn command() -> clap::Command {
+    Cli::command()
 }
 
 /// What a link does to packets, in either direction.
@@ -146,10 +182,23 @@ impl Ways {
     }
 }
 
-/// Parses the command line and runs it; the exit code is 0, 1 (failed, with one line on stderr) or 2 (usage).
+/// Parses the command line and runs it; the exit code is 0, 1 (failed, with one line on stderr) or 2 (usage, or a
+/// configuration that cannot be).
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let done = match &cli.command {
+        Some(Command::CheckConfig(args)) => match args.run() {
+            Ok(true) => Ok(()),
+            Ok(false) => return ExitCode::from(2),
+            Err(e) => Err(e),
+        },
+        Some(Command::Doctor(args)) => match doctor::run(args) {
+            Ok(true) => Ok(()),
+            Ok(false) => return ExitCode::FAILURE,
+            Err(e) => Err(e),
+        },
+        Some(Command::Completions(args)) => pages::completions(args),
+        Some(Command::Man(args)) => pages::man(args),
         None => demo::run(&cli.demo),
         Some(Command::Demo(args)) => demo::run(args),
         Some(Command::Import(args)) => ingest::run(args),

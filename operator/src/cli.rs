@@ -1,4 +1,4 @@
-//! The operator daemon's command line: flags over a TOML file over defaults.
+//! The operator daemon's command line: flags over environment over a TOML file over defaults.
 
 mod args;
 mod infer;
@@ -7,6 +7,7 @@ mod known;
 mod pair;
 mod played;
 mod report;
+mod settings;
 mod skills;
 
 use std::io::IsTerminal;
@@ -19,12 +20,14 @@ use anyhow::{Context, bail};
 use nalgebra::UnitQuaternion;
 use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
+use telemime_endpoint::config::{self, Layers, Settings};
 use telemime_endpoint::peers::{Peers, Role, Source, Whom};
-use telemime_endpoint::{External, HostClock, Identity, Meter, Mono, Trust, quic};
-use tokio::sync::mpsc;
+use telemime_endpoint::supervisor::Supervisor;
+use telemime_endpoint::{External, HostClock, Identity, Meter, Mono, Trust, logs, metrics, quic};
+use tokio::sync::{mpsc, watch};
 
 use crate::console::{self, Known, Live};
-use crate::daemon::{Daemon, Learning, Reopen};
+use crate::daemon::{Daemon, Learning, Reopen, Snapshot};
 use crate::demonstration::{Demonstration, Sample};
 use crate::input::read::Clock;
 use crate::placed::Motion;
@@ -45,11 +48,25 @@ pub use skills::Skills;
 /// # Errors
 /// One line that says what to do; also if the task was interrupted.
 pub fn run(args: &Args) -> anyhow::Result<()> {
+    if args.print_config {
+        return cli::say(config::example::<Args>().trim_end());
+    }
+    if args.print_schema {
+        return cli::say(&serde_json::to_string_pretty(&config::schema::<Args>())?);
+    }
+    let below = Layers::read::<Args>(args.config.as_deref(), &config::environment()).table()?;
+    let args = args.clone().over(below)?;
+    args.judge()?;
+    let logging = logs::start(args.log_format)?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
         .context("no runtime")?;
-    runtime.block_on(operate(args.clone().merged()?))
+    let done = runtime.block_on(operate(args));
+    if let Some(logging) = logging {
+        logging.finish();
+    }
+    done
 }
 
 async fn operate(args: Args) -> anyhow::Result<()> {
@@ -121,6 +138,11 @@ async fn operate(args: Args) -> anyhow::Result<()> {
             quic::client(&identity, &trust, socket, &meter)
         })
     };
+    let shown = args
+        .metrics
+        .map(|addr| serve_metrics(addr, &log))
+        .transpose()?;
+    supervised(&format!("reaches for {}", known.address));
     let daemon = Daemon {
         endpoint,
         reopen: Some(reopen),
@@ -137,7 +159,12 @@ async fn operate(args: Args) -> anyhow::Result<()> {
             refine: args.refine,
             save: args.save.clone(),
         },
-        patience: Duration::from_secs_f64(args.patience.unwrap_or(10.0).clamp(0.1, 3600.0)),
+        shown,
+        patience: Duration::from_secs_f64(
+            args.patience
+                .unwrap_or(settings::PATIENCE_S)
+                .clamp(0.1, 3600.0),
+        ),
     };
     let (notices, heard) = mpsc::unbounded_channel();
     let progress = std::io::stderr().is_terminal() && !args.json;
@@ -153,6 +180,7 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         done = daemon.run(&mut task, quit, words, &notices) => Some(done),
         () = source.follow(&trust, complain) => None,
     };
+    Supervisor::from_environment().stopping();
     drop(notices);
     let played = listener.await.context("the log ended early")?;
     let summary = done.context("the peer file is not followed any more")??;
@@ -167,6 +195,31 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     match summary.outcome {
         Outcome::Completed => Ok(()),
         Outcome::Interrupted(why) => bail!("{why}"),
+    }
+}
+
+/// Serves metrics from now on; they are to be sent here.
+fn serve_metrics(addr: SocketAddr, log: &report::Log) -> anyhow::Result<watch::Sender<Snapshot>> {
+    let (shown, seen) = watch::channel(Snapshot::default());
+    let addr = metrics::serve(addr, move || seen.borrow().page())?;
+    let url = format!("http://{addr}/metrics");
+    log.say(&Event::Metrics { url });
+    Ok(shown)
+}
+
+/// Tells a supervisor that we are ready and, for as long as this thread goes round, alive.
+fn supervised(status: &str) {
+    let mut supervisor = Supervisor::from_environment();
+    supervisor.ready(status);
+    if let Some(every) = supervisor.every() {
+        tokio::spawn(async move {
+            let clock = HostClock::new();
+            let mut due = tokio::time::interval(every / 2);
+            loop {
+                due.tick().await;
+                supervisor.alive(clock.now());
+            }
+        });
     }
 }
 
@@ -187,7 +240,7 @@ fn make_task(
 ) -> anyhow::Result<(Task, Option<Played>)> {
     match (&args.replay[..], &args.play) {
         ([first, then @ ..], None) => {
-            let rest_s = args.rest.unwrap_or(1.0).clamp(0.0, 60.0);
+            let rest_s = args.rest.unwrap_or(settings::REST_S).clamp(0.0, 60.0);
             let recording = |path: &PathBuf| -> anyhow::Result<Recording> {
                 let samples = skills.unseen(path)?.samples().to_vec();
                 Ok(Recording { samples, rest_s })

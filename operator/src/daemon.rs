@@ -1,5 +1,7 @@
 //! The operator's shell: dials, redials, feeds the session samples and moves its bytes.
 
+mod attend;
+
 use std::borrow::Cow;
 use std::fmt;
 use std::future::Future;
@@ -31,6 +33,8 @@ use crate::lessons::{Lesson, LessonError, Lessons};
 use crate::recognise::Recogniser;
 use crate::session::{Counters, Event, Output, Seen as LinkSeen, Session, SessionConfig};
 use crate::task::{Advice, Outcome, Task};
+
+pub use attend::Snapshot;
 
 /// A robot that has ended its stream gets this long to say why.
 const LAST_WORDS: Duration = Duration::from_millis(500);
@@ -84,6 +88,8 @@ pub struct Daemon {
     pub learning: Learning,
     /// Give up if the first connection takes longer than this.
     pub patience: Duration,
+    /// Where metrics go, if anybody wants them.
+    pub shown: Option<watch::Sender<Snapshot>>,
 }
 
 /// What a daemon learns from while driving without being told to.
@@ -319,6 +325,7 @@ impl Daemon {
             let Some(link) = link else { break };
             let mut last = link.seen();
             summary.sessions += 1;
+            self.begun();
             let _ = notices.send(Notice::Connected {
                 epoch: link.epoch,
                 version: link.version,
@@ -344,6 +351,7 @@ impl Daemon {
                     &mut lessons,
                 )
                 .await;
+            self.ended(&session);
             seen = Some(last);
             stop = session.stop_is_unconfirmed();
             summary.counters.add(session.counters());
@@ -490,9 +498,11 @@ impl Daemon {
                 if matches!(event, Event::Engaged { .. }) {
                     marks.granted.get_or_insert(marks.requested);
                 }
+                self.saw(&event);
                 task.on_event(now, &event);
                 let _ = notices.send(Notice::Event(now, event));
             }
+            self.goes_on(session);
             if let Some(live) = task.person() {
                 live.sent(self.meter.counts().sent.bytes);
             }

@@ -14,6 +14,7 @@ pub mod input;
 pub mod learn;
 pub mod lessons;
 pub mod placed;
+pub mod program;
 pub mod recognise;
 pub mod recording;
 pub mod session;

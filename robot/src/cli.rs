@@ -1,35 +1,37 @@
-//! The robot daemon's command line: flags over a TOML file over defaults.
+//! The robot daemon's command line: flags over environment over a TOML file over defaults.
 
 mod record;
 mod report;
+mod settings;
 mod surroundings;
 
 use std::io::IsTerminal;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use serde::Deserialize;
 use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
+use telemime_endpoint::config::{self, Layers, Settings};
 use telemime_endpoint::pairing::Own;
 use telemime_endpoint::peers::{Role, Source, Whom};
-use telemime_endpoint::{External, Fingerprint, HostClock, Identity, Meter, Trust, quic};
-use telemime_sim::arm::{LoadOptions, Payload};
+use telemime_endpoint::supervisor::Supervisor;
+use telemime_endpoint::{
+    External, Fingerprint, HostClock, Identity, Meter, Trust, logs, metrics, quic,
+};
+use telemime_sim::arm::Payload;
 use telemime_sim::link::parse_duration_s;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
 use crate::blackbox::{Header, Keeper, Recorder, SPAN_S, Saved, taps};
 use crate::clock::Origin;
-use crate::control::ControlConfig;
-use crate::daemon::{Daemon, Failure, Notice};
+use crate::daemon::{Attendant, Daemon, Failure, Notice};
 use crate::desk::Desk;
-use crate::driver::PATIENCE_S;
 use crate::driver::bridge::{Bridge, Words};
 use crate::refused::Refused;
-use crate::rig::{Rig, RigOptions};
+use crate::rig::Rig;
 use crate::servo::thread::Servo;
 use crate::servo::{self, Priority, Ticket};
 use crate::session::SessionConfig;
@@ -44,7 +46,7 @@ use report::{Log, engaged, nth};
 /// latched; SIGUSR1 does the same), reset, blackbox, pair, yes, no or quit.
 #[derive(clap::Args, Debug, Clone, Default)]
 pub struct Args {
-    /// Read settings from this TOML file; flags override it.
+    /// Read settings from this TOML file; the environment (TELEMIME_ROBOT_…) overrides it, and flags both.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
     /// Listen for the operator on this UDP address [default: 0.0.0.0:4433].
@@ -124,48 +126,40 @@ pub struct Args {
     /// fault, on `blackbox` or on SIGUSR2; `telemime replay` reads them.
     #[arg(long, value_name = "DIR")]
     pub black_box: Option<PathBuf>,
+    /// Serve metrics for Prometheus at http://ADDR/metrics [127.0.0.1:9433 if no address is given].
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = METRICS)]
+    pub metrics: Option<SocketAddr>,
+    /// Log to stderr what happens, each line with time and level, instead of telling it on stdout; RUST_LOG chooses what.
+    #[arg(long, value_name = "FORMAT", value_enum)]
+    pub log_format: Option<logs::Format>,
+    /// Print an example of the configuration file, with the defaults, and end.
+    #[arg(long)]
+    pub print_config: bool,
+    /// Print the configuration file's JSON Schema, and end.
+    #[arg(long)]
+    pub print_schema: bool,
     /// Print events as JSON lines on stdout.
     #[arg(long)]
     pub json: bool,
+    /// What the file alone can set: planes the arm keeps clear of …
+    #[arg(skip)]
+    pub planes: Vec<[f64; 4]>,
+    /// … whether its links are kept apart …
+    #[arg(skip)]
+    pub self_collision: Option<bool>,
+    /// … how far, m …
+    #[arg(skip)]
+    pub stop_distance_m: Option<f64>,
+    /// … and from how much farther on they are slowed, m.
+    #[arg(skip)]
+    pub slow_distance_m: Option<f64>,
     /// Stop when stdin ends: for a parent process that must not leave orphans.
     #[arg(long, hide = true)]
     pub follow_stdin: bool,
 }
 
-/// The TOML file; every key may be left out.
-#[derive(Debug, Clone, Default, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct File {
-    listen: Option<SocketAddr>,
-    identity: Option<PathBuf>,
-    #[serde(default)]
-    peers: Vec<String>,
-    peer_file: Option<PathBuf>,
-    name: Option<String>,
-    clock_dispersion: Option<String>,
-    urdf: Option<PathBuf>,
-    tip: Option<String>,
-    #[serde(default)]
-    fixed: std::collections::BTreeMap<String, f64>,
-    start: Option<Vec<f64>>,
-    payload: Option<String>,
-    keep_above_m: Option<f64>,
-    /// Normal and place of each: what has n·x ≥ d is allowed.
-    #[serde(default)]
-    planes: Vec<[f64; 4]>,
-    self_collision: Option<bool>,
-    stop_distance_m: Option<f64>,
-    slow_distance_m: Option<f64>,
-    contact_plane: Option<[f64; 4]>,
-    dead_time_s: Option<f64>,
-    bandwidth_rad_s: Option<f64>,
-    protocol_max: Option<u16>,
-    record: Option<PathBuf>,
-    driver: Option<String>,
-    driver_patience_s: Option<f64>,
-    realtime: Option<u8>,
-    black_box: Option<PathBuf>,
-}
+/// Where metrics are served unless said otherwise.
+const METRICS: &str = "127.0.0.1:9433";
 
 /// `JOINT=VALUE` as a joint's name and its value, rad or m.
 ///
@@ -184,92 +178,52 @@ pub fn parse_fixed(text: &str) -> Result<(String, f64), String> {
 /// # Errors
 /// One line that says what to do.
 pub fn run(args: &Args) -> anyhow::Result<()> {
+    if args.print_config {
+        return cli::say(config::example::<Args>().trim_end());
+    }
+    if args.print_schema {
+        return cli::say(&serde_json::to_string_pretty(&config::schema::<Args>())?);
+    }
+    let below = Layers::read::<Args>(args.config.as_deref(), &config::environment()).table()?;
+    let args = args.clone().over(below)?;
+    args.judge()?;
+    let logging = logs::start(args.log_format)?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
         .context("no runtime")?;
-    runtime.block_on(serve(args))
+    let served = runtime.block_on(serve(&args));
+    if let Some(logging) = logging {
+        logging.finish();
+    }
+    served
 }
 
 async fn serve(args: &Args) -> anyhow::Result<()> {
-    let file = match &args.config {
-        Some(path) => read_config(path)?,
-        None => File::default(),
-    };
-    let barrier = surroundings::barrier(args, &file)?;
-    let contact = surroundings::contact(args, &file)?;
-    let payload = surroundings::payload(args, &file)?;
-    let identity = args.identity.clone().or(file.identity);
-    let key_file = identity.unwrap_or_else(|| admin::key_file(Role::Robot));
+    let key_file = args.identity.clone();
+    let key_file = key_file.unwrap_or_else(|| admin::key_file(Role::Robot));
     let identity = Identity::load_or_create(&key_file)?;
-    let given = if args.peer.is_empty() {
-        file.peers
-    } else {
-        args.peer.clone()
-    };
-    let given = given
-        .iter()
-        .map(|p| p.parse())
-        .collect::<Result<Vec<Fingerprint>, _>>()?;
+    let given = args.fingerprints()?;
     let expected = args.pair_expect.as_ref().map(|text| text.parse());
     let expected: Option<Fingerprint> = expected.transpose()?;
-    let dispersion = file.clock_dispersion.as_deref().map(cli::dispersion);
-    let dispersion = dispersion.transpose().map_err(anyhow::Error::msg)?;
-    let dispersion = args.clock_dispersion.or(dispersion);
-    let peer_file = args.peer_file.clone().or(file.peer_file);
     let source = Source {
-        path: peer_file.unwrap_or_else(admin::peer_file),
+        path: args.peer_file.clone().unwrap_or_else(admin::peer_file),
         whom: Whom::Operators(given),
     };
     let trust = Trust::new([]);
     source.read(&trust)?;
     let own = Own {
-        name: admin::own_name(args.name.as_deref().or(file.name.as_deref()))?,
+        name: admin::own_name(args.name.as_deref())?,
         key: identity.fingerprint(),
     };
     let mut desk = Desk::new(own, trust.clone(), Some(source.path.clone())).expecting(expected);
-    let mut fixed = file.fixed;
-    fixed.extend(args.fixed.iter().cloned());
-    let driver = args.driver.clone().or(file.driver);
-    let mut bridge = driver.as_deref().map(Bridge::start).transpose()?;
-    let patience_s = args
-        .driver_patience
-        .or(file.driver_patience_s)
-        .unwrap_or(PATIENCE_S);
-    anyhow::ensure!(
-        (0.01..=10.0).contains(&patience_s),
-        "--driver-patience {patience_s} s: from 10ms to 10s"
-    );
-    let priority = args.realtime.or(file.realtime);
-    let priority = priority.map(Priority::new).transpose()?;
-    let start = match &bridge {
-        Some(bridge) if file.start.is_none() => Some(bridge.posture()),
-        Some(_) => {
-            bail!("start and driver: an arm behind a driver starts where it is; leave one out")
-        }
-        None => args.start.clone().or(file.start),
-    };
-    let options = RigOptions {
-        urdf: args.urdf.clone().or(file.urdf),
-        load: LoadOptions {
-            tip: args.tip.clone().or(file.tip),
-            fixed,
-            payload,
-        },
-        contact,
-        start,
-        driver: bridge.is_some(),
-        control: ControlConfig {
-            dead_time_s: args.dead_time.or(file.dead_time_s).unwrap_or(0.0),
-            omega: args
-                .bandwidth
-                .or(file.bandwidth_rad_s)
-                .unwrap_or(ControlConfig::default().omega),
-            barrier,
-            ..ControlConfig::default()
-        },
-        ..RigOptions::default()
-    };
+    let mut bridge = args.driver.as_deref().map(Bridge::start).transpose()?;
+    let patience_s = args.patience_s()?;
+    let priority = args.realtime.map(Priority::new).transpose()?;
+    let mut options = args.rig_options()?;
+    if let Some(bridge) = &bridge {
+        options.start = Some(bridge.posture());
+    }
     let (urdf, text) = Rig::text(options.urdf.as_deref())?;
     if let Some(bridge) = &bridge {
         // Before the posture is looked at: it is one of the driver's joints.
@@ -279,30 +233,30 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     // Of our own arm there is nothing to tell.
     if options.urdf.is_some() {
         for notice in rig.arm.notices() {
-            eprintln!("note: {notice}");
+            logs::note(&notice.to_string());
         }
     }
-    let record = args.record.clone().or(file.record);
-    let recorder = record::ticks(record.as_deref(), &rig)?;
-    let listen = args
-        .listen
-        .or(file.listen)
-        .unwrap_or_else(|| SocketAddr::from(([0, 0, 0, 0], 4433)));
+    let recorder = record::ticks(args.record.as_deref(), &rig)?;
+    let listen = match args.listen {
+        Some(addr) => addr,
+        None => settings::LISTEN.parse().context("the usual address")?,
+    };
     let socket = quic::Socket::bind(listen).with_context(|| {
         format!("cannot listen on {listen}: choose another --listen, or stop what uses it")
     })?;
     let deaf = !args.follow_stdin && !std::io::stdin().is_terminal();
     if trust.is_empty() && args.pair.is_none() && !args.json {
-        eprintln!(
-            "note: no operator is known, so nobody will be let in: pair one (pair, or --pair), or give --peer"
+        logs::note(
+            "no operator is known, so nobody will be let in: pair one (pair, or --pair), or give --peer",
         );
     }
     if args.pair.is_some() && expected.is_none() && deaf {
-        eprintln!(
-            "note: stdin is no terminal, so nobody can say yes to a code: give --pair-expect FINGERPRINT"
+        logs::note(
+            "stdin is no terminal, so nobody can say yes to a code: give --pair-expect FINGERPRINT",
         );
     }
-    let endpoint = quic::server(&identity, &trust, socket, &Meter::default())?;
+    let meter = Meter::default();
+    let endpoint = quic::server(&identity, &trust, socket, &meter)?;
     let addr = endpoint.local_addr()?;
     let (rings, handle) = servo::rings();
     let mut station = match &mut bridge {
@@ -317,8 +271,8 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         json: args.json,
         out,
     };
-    let scribe = record::scribe(record.as_deref(), &rig, &log)?;
-    let keeper = match args.black_box.clone().or(file.black_box) {
+    let scribe = record::scribe(args.record.as_deref(), &rig, &log)?;
+    let keeper = match args.black_box.clone() {
         Some(dir) => {
             // Better now than after the stop that it was for.
             std::fs::create_dir_all(&dir)
@@ -326,7 +280,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
                 .with_context(|| format!("--black-box {} cannot be written", dir.display()))?;
             let (tap, feed) = taps(&station.room());
             station = station.recorded(tap);
-            let recorder = Recorder::new(Header::new(&rig, driver.clone()), feed, SPAN_S);
+            let recorder = Recorder::new(Header::new(&rig, args.driver.clone()), feed, SPAN_S);
             let log = log.clone();
             let say = move |due, saved: Saved| log.black_box(due, &saved);
             Some(Keeper::start(recorder, &dir, say).context("no thread for the black box")?)
@@ -340,7 +294,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let by_signal = asker.clone();
     on_signal(SignalKind::user_defined2(), move || match &by_signal {
         Some(asker) => asker.ask(),
-        None => eprintln!("note: SIGUSR2, but there is no black box: give --black-box DIR"),
+        None => logs::note("SIGUSR2, but there is no black box: give --black-box DIR"),
     })?;
     let (quit, words) = cli::listen(args.follow_stdin, cli::ROBOT_WORDS, move || {
         brake.stop_here()
@@ -383,15 +337,27 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         HostClock::new(),
         rig.info(),
         SessionConfig {
-            versions: cli::versions(args.protocol_max.or(file.protocol_max))?,
+            versions: cli::versions(args.protocol_max)?,
             ..SessionConfig::default()
         },
         handle,
         Some(running.timing.clone()),
         desk,
     );
+    let supervisor = Supervisor::from_environment();
+    supervisor.ready(&format!("{} listens on {addr}", rig.arm.name()));
+    let (attendant, shown) = Attendant::new(supervisor, meter);
+    if let Some(addr) = args.metrics {
+        let arm = rig.arm.name().to_owned();
+        let addr = metrics::serve(addr, move || shown.borrow().page(&arm))?;
+        let url = format!("http://{addr}/metrics");
+        log.say(&Event::Metrics { url: url.clone() }, || {
+            format!("metrics {url}")
+        });
+    }
     let daemon = daemon
-        .with_external(dispersion.map(External::host))
+        .attended(Some(attendant))
+        .with_external(args.clock_dispersion.map(External::host))
         .showing(rig.described())
         .with_black_box(asker)
         .recorded(scribe);
@@ -404,7 +370,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     ));
     let served = tokio::select! {
         served = daemon.run(quit, words, notices) => served,
-        () = source.follow(&trust, |e| eprintln!("note: {e}; whoever was trusted still is")) => Ok(()),
+        () = source.follow(&trust, |e| logs::note(&format!("{e}; whoever was trusted still is"))) => Ok(()),
     };
     let recorder = listener.await.context("the log ended early")?;
     let timing = running.timing.clone();
@@ -434,12 +400,6 @@ fn on_signal(kind: SignalKind, then: impl Fn() + Send + 'static) -> anyhow::Resu
         }
     });
     Ok(())
-}
-
-fn read_config(path: &Path) -> anyhow::Result<File> {
-    let text =
-        std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-    toml::from_str(&text).map_err(|e| anyhow::anyhow!("{}: {e}", path.display()))
 }
 
 async fn listen_to(
@@ -559,22 +519,4 @@ async fn listen_to(
         }
     }
     recorder
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_documented_configuration_is_understood_and_complete() {
-        let text = include_str!("../../docs/commands.md");
-        let example = text
-            .split("```toml robot\n")
-            .nth(1)
-            .and_then(|rest| rest.split("```").next())
-            .unwrap();
-        let file: File = toml::from_str(example).unwrap();
-        assert!(!format!("{file:?}").contains("None"), "a key is missing");
-        assert_eq!((file.peers.len(), file.fixed["finger_joint"]), (1, 0.02));
-    }
 }

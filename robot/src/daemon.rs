@@ -1,12 +1,16 @@
 //! The robot's shell: accepts one operator at a time, carries bytes to the session and reports from the servo.
 
+mod attend;
+
 use std::sync::Arc;
 use std::time::Duration;
 
 use quinn::{Connection, ConnectionError, Endpoint, Incoming, VarInt};
 use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{Control, ControlError, Writer};
-use telemime_endpoint::{External, Fingerprint, HostClock, Mono, Standing, Trust, quic, trust};
+use telemime_endpoint::{
+    External, Fingerprint, HostClock, Mono, Standing, Trust, logs, quic, trust,
+};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::wire::Version;
 use telemime_protocol::wire::arm::WireArm;
@@ -26,6 +30,8 @@ use crate::refused::{Reason, Refused, Tally};
 use crate::servo::thread::{Times, Timing};
 use crate::servo::{ArmFault, Handle, Order, Report};
 use crate::session::{Counters, Output, Seen, Session, SessionConfig};
+
+pub use attend::{Attendant, Snapshot};
 
 /// How often reports are taken from the servo's ring.
 const DRAIN: Duration = Duration::from_millis(4);
@@ -79,6 +85,7 @@ pub struct Daemon {
     asker: Option<Asker>,
     scribe: Option<Scribe>,
     fault: Option<ArmFault>,
+    attendant: Option<Attendant>,
 }
 
 /// Something for a log.
@@ -184,6 +191,7 @@ impl Daemon {
             asker: None,
             scribe: None,
             fault: None,
+            attendant: None,
         }
     }
 
@@ -249,7 +257,7 @@ impl Daemon {
                     Word::Reset => self.order(Order::Reset { operator: active.is_some(), stop: None }),
                     Word::BlackBox => match &self.asker {
                         Some(asker) => asker.ask(),
-                        None => eprintln!("note: there is no black box: start the robot with --black-box DIR"),
+                        None => logs::note("there is no black box: start the robot with --black-box DIR"),
                     },
                     Word::Pair(span) => {
                         let _ = notices.send(Notice::Pairing(self.desk.open(span)));
@@ -317,6 +325,7 @@ impl Daemon {
                 }
             }
         }
+        self.dismiss();
         // Nobody leaves before the arm is at rest; the operator hears of the stop at once.
         for _ in 0..MAX_STOP_DRAINS {
             self.servo.brake.stop_here();
@@ -456,12 +465,16 @@ impl Daemon {
             if let Some(active) = active.as_deref_mut() {
                 active.session.handle_report(&report, timing);
             }
+            if let Some(attendant) = &mut self.attendant {
+                attendant.saw(&report);
+            }
             if let Some(scribe) = &mut self.scribe {
                 scribe.take(&report, active.as_deref().map(|active| &active.session));
             }
             let _ = notices.send(Notice::Report(Box::new(report)));
         }
         while self.servo.spent.pop().is_ok() {}
+        self.attend(active.as_deref());
         at_rest
     }
 
@@ -519,6 +532,9 @@ impl Daemon {
             let _ = notices.send(Notice::Path(knots.collect()));
         }
         let now = self.clock.now();
+        if let Some(attendant) = &mut self.attendant {
+            attendant.ended(&ended, now);
+        }
         let (clock, origin) = (ended.clock(), ended.clock().origin(now));
         let clock = clock
             .to_session(now)

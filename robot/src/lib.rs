@@ -12,6 +12,7 @@ pub mod daemon;
 pub mod desk;
 pub mod door;
 pub mod driver;
+pub mod program;
 pub mod recording;
 pub mod refused;
 pub mod rig;

@@ -23,6 +23,17 @@ pub enum Reason {
 }
 
 impl Reason {
+    /// All of them.
+    pub const ALL: [Self; 7] = [
+        Self::UnknownKey,
+        Self::RevokedKey,
+        Self::Version,
+        Self::Busy,
+        Self::Greeting,
+        Self::NoWindow,
+        Self::Handshake,
+    ];
+
     /// One word, for machines.
     pub fn word(self) -> &'static str {
         match self {
@@ -55,16 +66,20 @@ const MAX_APART: usize = 256;
 
 /// Counts refusals.
 #[derive(Debug, Default)]
-pub struct Tally(BTreeMap<(Reason, IpAddr), u32>);
+pub struct Tally {
+    hosts: BTreeMap<(Reason, IpAddr), u32>,
+    totals: BTreeMap<Reason, u64>,
+}
 
 impl Tally {
     /// Counts one. It is told the first time, and then the tenth, the hundredth and so on.
     pub fn count(&mut self, peer: SocketAddr, reason: Reason, why: String) -> Option<Refused> {
+        *self.totals.entry(reason).or_default() += 1;
         let mut who = (reason, peer.ip());
-        if self.0.len() >= MAX_APART && !self.0.contains_key(&who) {
+        if self.hosts.len() >= MAX_APART && !self.hosts.contains_key(&who) {
             who.1 = IpAddr::V4(Ipv4Addr::UNSPECIFIED);
         }
-        let times = self.0.entry(who).or_default();
+        let times = self.hosts.entry(who).or_default();
         *times = times.saturating_add(1);
         let times = *times;
         let round = 10_u32.checked_pow(times.ilog10()) == Some(times);
@@ -74,6 +89,11 @@ impl Tally {
             why,
             times,
         })
+    }
+
+    /// How often anybody was turned away, by reason.
+    pub fn totals(&self) -> &BTreeMap<Reason, u64> {
+        &self.totals
     }
 }
 
@@ -102,6 +122,8 @@ mod tests {
         let flood = (2..2000).filter_map(|host| count(host, 1, Reason::UnknownKey));
         let told = flood.count();
         assert!(told < MAX_APART + 5, "{told}");
-        assert!(tally.0.len() <= MAX_APART + 7);
+        assert!(tally.hosts.len() <= MAX_APART + 7);
+        let totals: Vec<_> = tally.totals().values().copied().collect();
+        assert_eq!(totals, [1 + 1998, 150]);
     }
 }

@@ -531,6 +531,7 @@ impl Pair {
             config,
             learning: self.learning.clone(),
             patience: Duration::from_secs(5),
+            shown: None,
         };
         let (quit, quit_rx) = watch::channel(false);
         let (words, words_rx) = mpsc::unbounded_channel();

@@ -1,16 +1,15 @@
-//! Flags over a TOML file over defaults, checked.
+//! The flags, and what a session makes of them.
 
-use std::collections::BTreeMap;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 use serde::Deserialize;
-use telemime_endpoint::cli;
+use telemime_endpoint::{cli, logs};
 
-use super::input::{InputArgs, InputFile};
+use super::input::InputArgs;
 use crate::console::Shape;
 use crate::placed::Placed;
 use crate::session::{FutureBound, SessionConfig};
@@ -24,7 +23,7 @@ use crate::session::{FutureBound, SessionConfig};
 /// refine learns from those kept, and save FILE writes the skill as it is now.
 #[derive(clap::Args, Debug, Clone, Default)]
 pub struct Args {
-    /// Read settings from this TOML file; flags override it.
+    /// Read settings from this TOML file; the environment (TELEMIME_OPERATOR_…) overrides it, and flags both.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
     /// The robot: where it is, or the name it was paired by.
@@ -151,6 +150,18 @@ pub struct Args {
     /// Seed of learning.
     #[arg(long)]
     pub seed: Option<u64>,
+    /// Serve metrics for Prometheus at http://ADDR/metrics [127.0.0.1:9434 if no address is given].
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = METRICS)]
+    pub metrics: Option<SocketAddr>,
+    /// Log to stderr what happens, each line with time and level, instead of telling it on stdout; RUST_LOG chooses what.
+    #[arg(long, value_name = "FORMAT", value_enum)]
+    pub log_format: Option<logs::Format>,
+    /// Print an example of the configuration file, with the defaults, and end.
+    #[arg(long)]
+    pub print_config: bool,
+    /// Print the configuration file's JSON Schema, and end.
+    #[arg(long)]
+    pub print_schema: bool,
     /// Print events as JSON lines on stdout.
     #[arg(long)]
     pub json: bool,
@@ -158,6 +169,9 @@ pub struct Args {
     #[arg(long, hide = true)]
     pub follow_stdin: bool,
 }
+
+/// Where metrics are served unless said otherwise.
+const METRICS: &str = "127.0.0.1:9434";
 
 /// Where the page is served unless said otherwise.
 const CONSOLE: &str = "127.0.0.1:8723";
@@ -208,7 +222,7 @@ const MAX_SILENCE_S: f64 = 0.25;
 /// Longest lease the robot grants, s.
 const MAX_LEASE_S: f64 = 1.0;
 
-fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
+pub(super) fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
     let wrong = || {
         format!("`{text}`: write a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)")
     };
@@ -234,7 +248,7 @@ fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
 /// Longest latency of an input, ms: with the network's it must stay below what a robot accepts as fresh.
 const MAX_LATENCY_MS: f64 = 300.0;
 
-fn parse_latency(text: &str) -> Result<f64, String> {
+pub(super) fn parse_latency(text: &str) -> Result<f64, String> {
     let (digits, factor) = match (text.strip_suffix("ms"), text.strip_suffix('s')) {
         (Some(digits), _) => (digits, 1.0),
         (None, Some(digits)) => (digits, 1e3),
@@ -246,147 +260,7 @@ fn parse_latency(text: &str) -> Result<f64, String> {
         .ok_or_else(|| format!("`{text}`: write a time from 0 to {MAX_LATENCY_MS} ms (62ms)"))
 }
 
-/// One file, or several.
-#[derive(Debug, Clone, Deserialize)]
-#[serde(untagged)]
-enum Files {
-    One(PathBuf),
-    Several(Vec<PathBuf>),
-}
-
-impl From<Files> for Vec<PathBuf> {
-    fn from(files: Files) -> Self {
-        match files {
-            Files::One(file) => vec![file],
-            Files::Several(files) => files,
-        }
-    }
-}
-
-/// The TOML file; every key may be left out.
-#[derive(Debug, Clone, Default, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct File {
-    connect: Option<String>,
-    identity: Option<PathBuf>,
-    peer: Option<String>,
-    peer_file: Option<PathBuf>,
-    clock_dispersion: Option<String>,
-    #[serde(default)]
-    learn: Vec<PathBuf>,
-    #[serde(rename = "match")]
-    matching: Option<String>,
-    #[serde(default)]
-    skills: Vec<PathBuf>,
-    replay: Option<Files>,
-    refine: Option<bool>,
-    play: Option<String>,
-    console: Option<SocketAddr>,
-    #[serde(default)]
-    frames: BTreeMap<String, Vec<f64>>,
-    correct: Option<PathBuf>,
-    hand_sigma_m: Option<f64>,
-    bound_m: Option<f64>,
-    turn_bound_rad: Option<f64>,
-    scale: Option<f64>,
-    axes: Option<Axes>,
-    #[serde(default)]
-    input: InputFile,
-    gain: Option<f64>,
-    future_bound: Option<String>,
-    path_bound_m: Option<f64>,
-    max_silence_s: Option<f64>,
-    min_interval_s: Option<f64>,
-    lease_s: Option<f64>,
-    rest_s: Option<f64>,
-    patience_s: Option<f64>,
-    protocol_max: Option<u16>,
-    record: Option<PathBuf>,
-    seed: Option<u64>,
-}
-
-fn read_config(path: &Path) -> anyhow::Result<File> {
-    let text =
-        std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-    toml::from_str(&text).map_err(|e| anyhow::anyhow!("{}: {e}", path.display()))
-}
-
 impl Args {
-    /// These flags over the file they name.
-    pub(super) fn merged(mut self) -> anyhow::Result<Self> {
-        let Some(path) = self.config.clone() else {
-            return Ok(self);
-        };
-        let file = read_config(&path)?;
-        let bound = file
-            .future_bound
-            .as_deref()
-            .map(parse_future_bound)
-            .transpose();
-        let bound = bound.map_err(|e| anyhow::anyhow!("{}: future_bound = {e}", path.display()))?;
-        self.connect = self.connect.or(file.connect);
-        self.identity = self.identity.or(file.identity);
-        self.peer = self.peer.or(file.peer);
-        self.peer_file = self.peer_file.or(file.peer_file);
-        let dispersion = file.clock_dispersion.as_deref().map(cli::dispersion);
-        let dispersion = dispersion.transpose().map_err(anyhow::Error::msg)?;
-        self.clock_dispersion = self.clock_dispersion.or(dispersion);
-        if self.learn.is_empty() && self.skill.is_empty() {
-            (self.learn, self.skill) = (file.learn, file.skills);
-        }
-        self.matching = self.matching.or(file.matching);
-        let free = self.replay.is_empty() && self.play.is_none() && self.console.is_none();
-        if free && self.input.input.is_none() {
-            self.replay = file.replay.map_or_else(Vec::new, Vec::from);
-            self.play = file.play;
-            self.console = file.console;
-            // As on the command line: there is nothing to refine by what is only played.
-            self.refine |= file.refine.unwrap_or(false) && self.play.is_none();
-        }
-        if let Some(ms) = file
-            .input
-            .latency_ms
-            .filter(|_| self.input_latency.is_none())
-        {
-            let latency = parse_latency(&format!("{ms}ms"));
-            let latency = latency
-                .map_err(|e| anyhow::anyhow!("{}: [input] latency_ms = {e}", path.display()))?;
-            self.input_latency = Some(latency);
-        }
-        self.glitch_gate |= file.input.glitch_gate.unwrap_or(false);
-        let other = self.play.is_some() || self.console.is_some() || !self.replay.is_empty();
-        let input = self.input.over(file.input, !other);
-        input.with_context(|| path.display().to_string())?;
-        if self.frame.is_empty() && self.play.is_some() {
-            self.frame = file
-                .frames
-                .iter()
-                .map(|(name, numbers)| Placed::new(name, numbers))
-                .collect::<Result<_, _>>()
-                .with_context(|| format!("{}: [frames]", path.display()))?;
-        }
-        if self.play.is_some() {
-            self.correct = self.correct.or(file.correct);
-        }
-        self.hand_sigma = self.hand_sigma.or(file.hand_sigma_m);
-        self.bound = self.bound.or(file.bound_m);
-        self.turn_bound = self.turn_bound.or(file.turn_bound_rad);
-        self.scale = self.scale.or(file.scale);
-        self.axes = self.axes.or(file.axes);
-        self.gain = self.gain.or(file.gain);
-        self.future_bound = self.future_bound.or(bound);
-        self.path_bound = self.path_bound.or(file.path_bound_m);
-        self.max_silence = self.max_silence.or(file.max_silence_s);
-        self.min_interval = self.min_interval.or(file.min_interval_s);
-        self.lease = self.lease.or(file.lease_s);
-        self.rest = self.rest.or(file.rest_s);
-        self.patience = self.patience.or(file.patience_s);
-        self.protocol_max = self.protocol_max.or(file.protocol_max);
-        self.record = self.record.or(file.record);
-        self.seed = self.seed.or(file.seed);
-        Ok(self)
-    }
-
     /// Whether all there is to predict with is what will be taught in the page: its hand moves in base axes, metre for
     /// metre.
     fn is_taught_in_the_page(&self) -> bool {
@@ -409,7 +283,7 @@ impl Args {
             hand_sigma_m: self.hand_sigma.unwrap_or(defaults.hand_sigma_m),
             scale: self.scale.or(page.then_some(1.0)),
             rotation: self.axes.unwrap_or(axes).rotation(),
-            versions: telemime_endpoint::cli::versions(self.protocol_max)?,
+            versions: cli::versions(self.protocol_max)?,
         };
         let within = |name: &str, value: f64, low: f64, high: f64| -> anyhow::Result<()> {
             if !(value > low && value <= high) {
@@ -464,57 +338,6 @@ mod tests {
         for bad in ["", "40", "mm", "-1mm", "nanmm", "infsigma"] {
             assert!(parse_future_bound(bad).is_err(), "{bad}");
         }
-    }
-
-    #[test]
-    fn flags_override_the_file_and_unknown_keys_are_refused() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("operator.toml");
-        std::fs::write(
-            &path,
-            "connect = \"robot:4433\"\nscale = 0.2\nfuture_bound = \"40mm\"\n",
-        )
-        .unwrap();
-        let args = Args {
-            config: Some(path.clone()),
-            scale: Some(0.1),
-            ..Args::default()
-        };
-        let merged = args.clone().merged().unwrap();
-        assert_eq!(
-            (merged.connect.as_deref(), merged.scale),
-            (Some("robot:4433"), Some(0.1))
-        );
-        assert_eq!(
-            merged.session().unwrap().future_bound,
-            FutureBound::Absolute(0.04)
-        );
-        std::fs::write(&path, "conect = \"robot:4433\"\n").unwrap();
-        let error = args.merged().unwrap_err().to_string();
-        assert!(
-            error.contains("conect") && error.contains("operator.toml"),
-            "{error}"
-        );
-    }
-
-    #[test]
-    fn the_documented_configuration_is_understood_and_complete() {
-        let text = include_str!("../../../docs/commands.md");
-        let example = text
-            .split("```toml operator\n")
-            .nth(1)
-            .and_then(|rest| rest.split("```").next())
-            .unwrap()
-            .replace("# play", "play")
-            .replace("# console", "console")
-            .replace("# correct", "correct")
-            .replace("# hand_sigma_m", "hand_sigma_m")
-            .replace("# bound_m", "bound_m")
-            .replace("# turn_bound_rad", "turn_bound_rad");
-        let file: File = toml::from_str(&example).unwrap();
-        assert!(!file.frames.is_empty(), "[frames] is missing");
-        assert!(!format!("{file:?}").contains("None"), "a key is missing");
-        parse_future_bound(&file.future_bound.unwrap()).unwrap();
     }
 
     #[test]

@@ -1,8 +1,8 @@
 //! Flags of a tracked hand.
 
 use std::net::IpAddr;
+use std::path::PathBuf;
 
-use anyhow::bail;
 use serde::Deserialize;
 
 use super::report::{Event, Log};
@@ -66,7 +66,7 @@ pub(super) struct InputFile {
     joint: Option<String>,
     unit: Option<String>,
     time_unit: Option<String>,
-    grip_range: Option<(f64, f64)>,
+    grip_range: Option<String>,
     camera: Option<String>,
     mirror: Option<bool>,
     frame_size: Option<String>,
@@ -103,13 +103,9 @@ impl InputArgs {
         self.joint = self.joint.take().or(file.joint);
         self.unit = self.unit.or(word("unit", file.unit)?);
         self.time_unit = self.time_unit.or(word("time_unit", file.time_unit)?);
-        if file
-            .grip_range
-            .is_some_and(|(closed, open)| !(closed != open))
-        {
-            bail!("[input] grip_range: closed and open are the same");
-        }
-        self.grip_range = self.grip_range.or(file.grip_range);
+        let range = file.grip_range.as_deref().map(grip_range).transpose();
+        let range = range.map_err(|e| anyhow::anyhow!("[input] grip_range = {e}"))?;
+        self.grip_range = self.grip_range.or(range);
         self.camera = self.camera.or(word("camera", file.camera)?);
         self.mirror |= file.mirror.unwrap_or(false);
         self.frame_size = self.frame_size.or(word("frame_size", file.frame_size)?);
@@ -119,6 +115,14 @@ impl InputArgs {
         self.engage |= file.engage.unwrap_or(false);
         self.until_end |= file.until_end.unwrap_or(false);
         Ok(())
+    }
+
+    /// The folder of frames that is read, if that is the source.
+    pub(super) fn folder(&self) -> Option<&PathBuf> {
+        match &self.input {
+            Some(Source::DepthFolder(path)) => Some(path),
+            _ => None,
+        }
     }
 
     /// The task of following `source`, which is read from now on.

@@ -7,6 +7,7 @@ use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use telemime_endpoint::Mono;
 use telemime_endpoint::cli::Printer;
+use telemime_endpoint::logs;
 use telemime_endpoint::meter::Counts;
 use telemime_endpoint::recording;
 use tokio::sync::mpsc;
@@ -234,6 +235,9 @@ pub enum Event {
     Input {
         source: String,
     },
+    Metrics {
+        url: String,
+    },
     LinkAsked(Shape),
     Kept {
         name: String,
@@ -417,6 +421,7 @@ impl Event {
             // With one performance, the line at the end says all.
             Self::Performed { .. } => return None,
             Self::Input { source } => format!("the hand comes from {source}"),
+            Self::Metrics { url } => format!("metrics {url}"),
             Self::Console { url } => format!("the page is at {url}"),
             Self::LinkAsked(_) => return None,
             Self::Kept { name } => format!("kept as {name}"),
@@ -498,7 +503,14 @@ impl Log {
     pub(super) fn say(&self, event: &Event) {
         if self.json {
             self.out.emit(event);
-        } else if let Some(text) = event.text() {
+        }
+        if logs::is_on() {
+            let often = matches!(
+                event,
+                Event::Progress { .. } | Event::Telemetry { .. } | Event::Bent { .. }
+            );
+            logs::event(event, &event.text().unwrap_or_default(), often);
+        } else if let Some(text) = event.text().filter(|_| !self.json) {
             self.out.say(text);
         }
     }

@@ -17,10 +17,8 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
-use hyper::server::conn::http1;
-use hyper_util::rt::{TokioIo, TokioTimer};
-use hyper_util::service::TowerToHyperService;
 use serde::Serialize;
+use telemime_endpoint::http::{self, Limits};
 use telemime_protocol::wire::arm::WireArm;
 use tokio::sync::{Semaphore, mpsc};
 use tokio::time::{Instant, sleep_until, timeout};
@@ -117,7 +115,12 @@ pub fn serve(addr: SocketAddr, random: [u8; 16], port: Port) -> Result<String, S
         .spawn(move || {
             runtime.block_on(async {
                 if let Ok(listener) = tokio::net::TcpListener::from_std(listener) {
-                    accept(&listener, &router(shared)).await;
+                    let limits = Limits {
+                        connections: MAX_CONNECTIONS,
+                        request: REQUEST,
+                        stay: None,
+                    };
+                    http::serve(listener, router(shared), limits).await;
                 }
             });
         })?;
@@ -341,29 +344,5 @@ async fn listen(
                 let _ = commands.try_send((number, Said::Wrong(why)));
             }
         }
-    }
-}
-
-/// A bounded number of connections, and none that only stands there.
-async fn accept(listener: &tokio::net::TcpListener, router: &Router) {
-    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
-    loop {
-        let place = Arc::clone(&places).acquire_owned().await;
-        let (Ok(place), Ok((stream, _))) = (place, listener.accept().await) else {
-            // Too many files are open, or the peer is gone: the next, in a moment.
-            sleep_until(Instant::now() + FRAME).await;
-            continue;
-        };
-        let _ = stream.set_nodelay(true);
-        let service = TowerToHyperService::new(router.clone());
-        tokio::spawn(async move {
-            let connection = http1::Builder::new()
-                .timer(TokioTimer::new())
-                .header_read_timeout(REQUEST)
-                .serve_connection(TokioIo::new(stream), service)
-                .with_upgrades();
-            let _ = connection.await;
-            drop(place);
-        });
     }
 }

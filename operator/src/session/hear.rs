@@ -20,8 +20,13 @@ impl Session {
         let message = match RobotControl::decode(&frame.payload) {
             Ok(message) => message,
             Err(_) if frame.ignorable => return Ok(()),
-            Err(e) => return Err(e),
+            Err(e) => {
+                self.tally.robot_control(None, frame.payload.len());
+                return Err(e);
+            }
         };
+        self.tally
+            .robot_control(Some(&message), frame.payload.len());
         match message {
             RobotControl::Info(info) => self.on_info(info),
             RobotControl::Arm(arm) => self.arm = Some(arm),
@@ -97,7 +102,10 @@ impl Session {
 
     /// A datagram. Nothing in it can end the session: what is wrong is dropped and counted.
     pub fn handle_datagram(&mut self, now: Stamp, bytes: &[u8]) {
-        match RobotDatagram::decode(bytes) {
+        let datagram = RobotDatagram::decode(bytes);
+        self.tally
+            .robot_datagram(datagram.as_ref().ok(), bytes.len());
+        match datagram {
             Ok(RobotDatagram::Ping { epoch, t1_us }) if epoch == self.epoch => {
                 let t_us = now.0 / 1000;
                 self.datagram(&OperatorDatagram::Pong {

@@ -21,6 +21,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use telemime_endpoint::reception::Reception;
+use telemime_endpoint::tally::Tally;
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::predict::Params;
 use telemime_protocol::skill::Skill;
@@ -107,6 +108,7 @@ pub struct Session {
     urgent: bool,
     next_stop: Option<Stamp>,
     counters: Counters,
+    tally: Tally,
     /// As they were at the request that is not answered yet.
     before: Option<Counters>,
     outputs: VecDeque<Output>,
@@ -152,6 +154,7 @@ impl Session {
             urgent: false,
             next_stop: None,
             counters: Counters::default(),
+            tally: Tally::default(),
             before: None,
             outputs: VecDeque::new(),
             events: VecDeque::new(),
@@ -196,6 +199,11 @@ impl Session {
     /// Requests made so far.
     pub fn requests(&self) -> u32 {
         self.engagement
+    }
+
+    /// What passed, by kind.
+    pub fn tally(&self) -> &Tally {
+        &self.tally
     }
 
     /// The counters.
@@ -598,10 +606,7 @@ impl Session {
             }
         };
         self.counters.messages += 1;
-        self.outputs.push_back(Output::Datagram {
-            bytes: self.version.encode_operator_datagram(&datagram),
-            motion: true,
-        });
+        self.say(&datagram, true);
     }
 
     fn request(&mut self, now: Stamp, drive: Drive) {
@@ -640,13 +645,18 @@ impl Session {
     }
 
     fn control(&mut self, message: &OperatorControl) {
-        self.outputs.push_back(Output::Control(message.encode()));
+        let bytes = message.encode();
+        self.tally.operator_control(Some(message), bytes.len());
+        self.outputs.push_back(Output::Control(bytes));
     }
 
     fn datagram(&mut self, message: &OperatorDatagram) {
-        self.outputs.push_back(Output::Datagram {
-            bytes: self.version.encode_operator_datagram(message),
-            motion: false,
-        });
+        self.say(message, false);
+    }
+
+    fn say(&mut self, message: &OperatorDatagram, motion: bool) {
+        let bytes = self.version.encode_operator_datagram(message);
+        self.tally.operator_datagram(Some(message), bytes.len());
+        self.outputs.push_back(Output::Datagram { bytes, motion });
     }
 }

@@ -1,13 +1,12 @@
 //! The commands that all binaries share: whose key is ours, and whom we trust.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
 use serde::Serialize;
 use telemime_protocol::wire::pair::Name;
 
-use crate::cli::config_dir;
+use crate::cli::{config_dir, say};
 use crate::identity::{Fingerprint, Identity};
 use crate::peers::{Peer, Peers, Role};
 
@@ -220,13 +219,4 @@ fn deed(deed: &Deed, file: &Path) -> anyhow::Result<(&'static str, Vec<Peer>)> {
         Deed::Revoke { who } => ("revoked: ", Peers::edit(file, |peers| peers.revoke(who))?),
         Deed::Remove { who } => ("removed: ", Peers::edit(file, |peers| peers.remove(who))?),
     })
-}
-
-fn say(text: &str) -> anyhow::Result<()> {
-    let mut out = std::io::stdout().lock();
-    match writeln!(out, "{text}").and_then(|()| out.flush()) {
-        // Whoever reads has read enough.
-        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
-        done => Ok(done?),
-    }
 }

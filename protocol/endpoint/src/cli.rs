@@ -92,33 +92,72 @@ pub fn one_line<'a>(
     line.replace('\n', " ")
 }
 
+/// Prints lines on stdout; a reader that has read enough is no error.
+///
+/// # Errors
+/// The system's.
+pub fn say(text: &str) -> anyhow::Result<()> {
+    let mut out = io::stdout().lock();
+    match writeln!(out, "{text}").and_then(|()| out.flush()) {
+        // Whoever reads has read enough.
+        Err(e) if e.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+        done => Ok(done?),
+    }
+}
+
 /// Lines a terminal or pipe may leave unread before more are dropped.
 const MAX_UNREAD_LINES: usize = 4096;
 
 /// Prints lines on stdout from a thread of its own, so that a terminal that is stopped, or a pipe that
 /// nobody reads, holds up nothing but the printing.
 #[derive(Debug, Clone)]
-pub struct Printer(SyncSender<String>);
+pub struct Printer(SyncSender<Job>);
+
+#[derive(Debug)]
+enum Job {
+    Print(String),
+    /// All before it is printed.
+    Tell(SyncSender<()>),
+}
 
 /// The printing thread; to be waited for at the end.
 #[derive(Debug)]
 pub struct Printing(Receiver<()>);
 
 impl Printer {
-    /// Starts printing.
+    /// Starts printing on stdout.
     ///
     /// # Errors
     /// The system's, if it gives no thread.
     pub fn start() -> io::Result<(Self, Printing)> {
-        let (lines_tx, lines) = sync_channel::<String>(MAX_UNREAD_LINES);
+        Self::onto(|line| {
+            let mut out = io::stdout().lock();
+            writeln!(out, "{line}").and_then(|()| out.flush())
+        })
+    }
+
+    /// The same on stderr.
+    ///
+    /// # Errors
+    /// The system's, if it gives no thread.
+    pub fn start_on_stderr() -> io::Result<(Self, Printing)> {
+        Self::onto(|line| writeln!(io::stderr().lock(), "{line}"))
+    }
+
+    fn onto(
+        print: impl Fn(&str) -> io::Result<()> + Send + 'static,
+    ) -> io::Result<(Self, Printing)> {
+        let (lines_tx, lines) = sync_channel(MAX_UNREAD_LINES);
         let (done, printing) = sync_channel(1);
         thread::Builder::new()
             .name("printer".into())
             .spawn(move || {
-                for line in lines {
-                    let mut out = io::stdout().lock();
-                    // A reader that has gone away is not our concern.
-                    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
+                for job in lines {
+                    match job {
+                        // A reader that has gone away is not our concern.
+                        Job::Print(line) => drop(print(&line)),
+                        Job::Tell(printed) => drop(printed.try_send(())),
+                    }
                 }
                 let _ = done.send(());
             })?;
@@ -128,7 +167,15 @@ impl Printer {
     /// Prints a line; drops it if too many are unread.
     pub fn say(&self, line: String) {
         // A full queue: whoever is to read has stopped reading.
-        let _ = self.0.try_send(line);
+        let _ = self.0.try_send(Job::Print(line));
+    }
+
+    /// Waits until what was said before is printed, but not for a reader that does not read.
+    pub fn flush(&self) {
+        let (printed, told) = sync_channel(1);
+        if self.0.try_send(Job::Tell(printed)).is_ok() {
+            let _ = told.recv_timeout(Duration::from_secs(1));
+        }
     }
 
     /// Prints `event` as one line of JSON.

@@ -4,15 +4,21 @@
 pub mod admin;
 pub mod cli;
 pub mod clock;
+pub mod config;
 pub mod control;
+pub mod http;
 pub mod identity;
+pub mod logs;
 pub mod meter;
+pub mod metrics;
 pub mod pacer;
 pub mod pairing;
 pub mod peers;
 pub mod quic;
 pub mod reception;
 pub mod recording;
+pub mod supervisor;
+pub mod tally;
 pub mod tls;
 pub mod trust;
 

@@ -88,10 +88,10 @@ impl TickRecorder {
             Err(_) => bail!("the recorder of {} failed", path.display()),
         }
         if lost > 0 {
-            eprintln!(
-                "note: {lost} ticks are missing in {}: the disk was too slow",
+            telemime_endpoint::logs::note(&format!(
+                "{lost} ticks are missing in {}: the disk was too slow",
                 path.display()
-            );
+            ));
         }
         Ok(())
     }

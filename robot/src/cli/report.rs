@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use telemime_endpoint::cli::Printer;
+use telemime_endpoint::logs;
 use telemime_endpoint::pairing::Candidate;
 use telemime_endpoint::reception::{Quantiles, Received};
 use telemime_endpoint::recording::{self, Outcome};
@@ -29,6 +30,9 @@ pub enum Event {
         joints: usize,
         lag_s: f64,
         radius_m: f64,
+    },
+    Metrics {
+        url: String,
     },
     Connected {
         epoch: u32,
@@ -128,7 +132,10 @@ impl Log {
     pub(super) fn say(&self, event: &Event, text: impl FnOnce() -> String) {
         if self.json {
             self.out.emit(event);
-        } else {
+        }
+        if logs::is_on() {
+            logs::event(event, &text(), false);
+        } else if !self.json {
             self.out.say(text());
         }
     }

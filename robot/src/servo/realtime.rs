@@ -51,7 +51,7 @@ impl Priority {
     }
 
     /// Gives it to the calling thread, and locks the process's memory.
-    pub(super) fn take(self) -> Realtime {
+    pub fn take(self) -> Realtime {
         let value = ThreadPriorityValue::try_from(self.0).map(ThreadPriority::Crossplatform);
         let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
         let priority = match value {

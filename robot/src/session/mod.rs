@@ -12,6 +12,7 @@ use std::sync::Arc;
 
 use nalgebra::{Quaternion, UnitQuaternion};
 use telemime_endpoint::reception::{Quantiles, Received, Reception, Spread};
+use telemime_endpoint::tally::Tally;
 use telemime_endpoint::{Mono, Pacer};
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
@@ -122,6 +123,7 @@ pub struct Session {
     newest_seq: u32,
     delay_s: f64,
     dropped: u32,
+    tally: Tally,
     reception: Reception,
     ages: Spread,
     down: Spread,
@@ -161,6 +163,7 @@ impl Session {
             newest_seq: 0,
             delay_s: 0.0,
             dropped: 0,
+            tally: Tally::default(),
             reception: Reception::default(),
             ages: Spread::default(),
             down: Spread::default(),
@@ -219,6 +222,11 @@ impl Session {
         }
     }
 
+    /// What passed, by kind.
+    pub fn tally(&self) -> &Tally {
+        &self.tally
+    }
+
     /// What has become of the session's datagrams on their way.
     pub fn seen(&self) -> Seen {
         Seen {
@@ -241,8 +249,13 @@ impl Session {
         let message = match OperatorControl::decode(&frame.payload) {
             Ok(message) => message,
             Err(_) if frame.ignorable => return Ok(()),
-            Err(e) => return Err(e),
+            Err(e) => {
+                self.tally.operator_control(None, frame.payload.len());
+                return Err(e);
+            }
         };
+        self.tally
+            .operator_control(Some(&message), frame.payload.len());
         match message {
             OperatorControl::Model { id, bytes } => self.store_model(now, id, &bytes),
             OperatorControl::Plan { id, bytes } => {
@@ -280,7 +293,10 @@ impl Session {
 
     /// A datagram. Nothing in it can end the session: what is wrong is dropped and counted.
     pub fn handle_datagram(&mut self, now: Mono, bytes: &[u8]) {
-        let taken = match self.version.decode_operator_datagram(bytes) {
+        let datagram = self.version.decode_operator_datagram(bytes);
+        self.tally
+            .operator_datagram(datagram.as_ref().ok(), bytes.len());
+        let taken = match datagram {
             Ok(OperatorDatagram::Motion(motion)) => {
                 self.arrived(now, motion.epoch, motion.seq, motion.state.t_us);
                 self.on_motion(now, &motion)
@@ -416,19 +432,16 @@ impl Session {
                 epoch: self.epoch,
                 t1_us: now.0 / 1000,
             };
-            self.outputs.push_back(Output::Datagram(ping.encode()));
+            self.say(&ping);
             if self.pings.is_multiple_of(RECEPTION_PINGS) && self.reception.newest() > 0 {
-                let reception = RobotDatagram::Reception(self.told());
-                self.outputs.push_back(Output::Datagram(reception.encode()));
-                let servo = RobotDatagram::Servo(self.servo_times());
-                self.outputs.push_back(Output::Datagram(servo.encode()));
+                self.say(&RobotDatagram::Reception(self.told()));
+                self.say(&RobotDatagram::Servo(self.servo_times()));
             }
         }
         if now >= self.next_telemetry {
             self.next_telemetry = now.offset_by_secs(self.pacer.interval_s());
             if let Some(telemetry) = self.telemetry(now) {
-                let datagram = RobotDatagram::Telemetry(telemetry).encode();
-                self.outputs.push_back(Output::Datagram(datagram));
+                self.say(&RobotDatagram::Telemetry(telemetry));
             }
         }
     }
@@ -687,7 +700,15 @@ impl Session {
     }
 
     fn send(&mut self, message: &RobotControl) {
-        self.outputs.push_back(Output::Control(message.encode()));
+        let bytes = message.encode();
+        self.tally.robot_control(Some(message), bytes.len());
+        self.outputs.push_back(Output::Control(bytes));
+    }
+
+    fn say(&mut self, message: &RobotDatagram) {
+        let bytes = message.encode();
+        self.tally.robot_datagram(Some(message), bytes.len());
+        self.outputs.push_back(Output::Datagram(bytes));
     }
 
     fn order(&mut self, order: Order) {
