@@ -228,7 +228,10 @@ pub fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
             eprintln!("telemime: {}", one_line(e.chain()));
-            ExitCode::FAILURE
+            match e.downcast_ref::<experiment::Missing>() {
+                Some(_) => ExitCode::from(experiment::Missing::EXIT),
+                None => ExitCode::FAILURE,
+            }
         }
     }
 }

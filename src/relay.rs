@@ -115,6 +115,7 @@ pub struct Relay {
     config: RelayConfig,
     clock: HostClock,
     shapes: watch::Receiver<Option<LinkConfig>>,
+    beginnings: watch::Receiver<Option<Mono>>,
 }
 
 struct Client {
@@ -143,7 +144,15 @@ impl Relay {
             config,
             clock,
             shapes: watch::channel(None).1,
+            beginnings: watch::channel(None).1,
         })
+    }
+
+    /// Both directions begin when it is said there, now or soon ([`Link::begin_at`]); else they begin with the relay.
+    #[must_use]
+    pub fn begun_by(mut self, beginnings: watch::Receiver<Option<Mono>>) -> Self {
+        self.beginnings = beginnings;
+        self
     }
 
     /// Takes on, in both directions, whatever is sent there; packets on their way arrive as they would have.
@@ -181,6 +190,13 @@ impl Relay {
                     if let Some(shape) = shape {
                         up = Link::new(shape.clone(), self.config.seed).beginning_at(began);
                         down = Link::new(shape, seed_down).beginning_at(began);
+                    }
+                    continue;
+                }
+                Ok(()) = self.beginnings.changed() => {
+                    if let Some(at) = *self.beginnings.borrow_and_update() {
+                        up.begin_at(at.0);
+                        down.begin_at(at.0);
                     }
                     continue;
                 }

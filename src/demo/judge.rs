@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::{Context, bail};
-use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use nalgebra::Vector3;
 use telemime_operator::cli::Event as Operator;
 use telemime_protocol::checkpoint::path::DecodedKnot;
 use telemime_protocol::spline::HermiteSpan;
@@ -18,6 +18,7 @@ use crate::measure::{
     Hand, Track, Turns, follow, is_edge, rms, rmse_m, sample_and_hold, smooth_jerk_m_s3,
 };
 use crate::relay::Fate;
+use crate::ticks::{self, Tick};
 
 /// One way of following the hand.
 pub(super) struct Way {
@@ -101,103 +102,20 @@ fn missing(ticks: &[Tick]) -> u64 {
     ticks.windows(2).map(gap).sum()
 }
 
-/// One tick of the robot's record.
-pub(super) struct Tick {
-    tick: u64,
-    pub(super) mono_ns: i64,
-    pub(super) tip_m: Vector3<f64>,
-    tip_q: UnitQuaternion<f64>,
-    pub(super) clamps: u32,
-    jerk_m_s3: f64,
-}
-
 /// The ticks of the first engagement, in order.
 pub(super) fn read_ticks(path: &Path, from_ns: i64) -> anyhow::Result<Vec<Tick>> {
-    let mut reader =
-        csv::Reader::from_path(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let headers = reader.headers()?.clone();
-    let column = |name: &str| {
-        headers
-            .iter()
-            .position(|h| h == name)
-            .with_context(|| format!("{}: no column {name}", path.display()))
-    };
-    let (tick, mono, clamps) = (column("tick")?, column("mono_ns")?, column("clamps")?);
-    let engagement = column("engagement")?;
-    let jerk = column("jerk")?;
-    let tip = [column("tip_x")?, column("tip_y")?, column("tip_z")?];
-    let [w, i, j, k] = [
-        column("tip_qw")?,
-        column("tip_qx")?,
-        column("tip_qy")?,
-        column("tip_qz")?,
-    ];
-    let (mut ticks, mut first) = (Vec::new(), None);
-    for row in reader.records() {
-        let row = row?;
-        let mono_ns: i64 = row[mono].parse()?;
-        let number: u32 = row[engagement].parse()?;
-        if mono_ns >= from_ns && *first.get_or_insert(number) == number {
-            let tip_m = Vector3::new(
-                row[tip[0]].parse()?,
-                row[tip[1]].parse()?,
-                row[tip[2]].parse()?,
-            );
-            let tip_q = Quaternion::new(
-                row[w].parse()?,
-                row[i].parse()?,
-                row[j].parse()?,
-                row[k].parse()?,
-            );
-            ticks.push(Tick {
-                tip_q: UnitQuaternion::from_quaternion(tip_q),
-                tick: row[tick].parse()?,
-                mono_ns,
-                tip_m,
-                clamps: row[clamps].parse()?,
-                jerk_m_s3: row[jerk].parse()?,
-            });
-        }
-    }
-    if ticks.is_empty() {
+    let mut ticks = ticks::read(path)?;
+    ticks.retain(|t| t.mono_ns >= from_ns);
+    let Some(first) = ticks.first().map(|t| t.engagement) else {
         bail!("{}: no tick after the engage", path.display());
-    }
+    };
+    ticks.retain(|t| t.engagement == first);
     Ok(ticks)
 }
 
 /// The mapping and the instant of the first engagement.
 pub(super) fn engagement(run: &Run) -> anyhow::Result<(Mapping, i64)> {
-    let found = run.robot.iter().find_map(|e| match e {
-        Robot::Engaged {
-            mono_ns,
-            scale,
-            rotation,
-            hand_m,
-            tip_m,
-            hand_q,
-            tip_q,
-            ..
-        } => {
-            let unit = |[w, x, y, z]: [f64; 4]| {
-                UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z))
-            };
-            let rotation = unit(*rotation);
-            let (hand_m, tip_m) = (Vector3::from(*hand_m), Vector3::from(*tip_m));
-            Some((
-                Mapping {
-                    scale: *scale,
-                    rotation,
-                    hand_m,
-                    tip_m,
-                    hand_orientation: hand_q.map(unit),
-                    tip_orientation: unit(*tip_q),
-                },
-                *mono_ns,
-            ))
-        }
-        _ => None,
-    });
-    found.context("the robot never engaged")
+    ticks::engagement(&run.robot).context("the robot never engaged")
 }
 
 /// The same arm as the robot's, for baselines.
@@ -426,12 +344,17 @@ fn path_error(path: &[PathPoint], truth: &Track, zero_ns: i64, run: &Run) -> (f6
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::UnitQuaternion;
+
     use super::*;
 
     fn tick(tick: u64) -> Tick {
         Tick {
             tick,
             mono_ns: 0,
+            engagement: 1,
+            follows: true,
+            age_s: 0.0,
             tip_m: Vector3::zeros(),
             tip_q: UnitQuaternion::identity(),
             clamps: 0,

@@ -11,7 +11,8 @@ use telemime_sim::link::{LinkConfig, Loss};
 use tokio::sync::watch;
 
 use super::Args;
-use super::processes::{Called, Process, start_robot, watch_robot};
+use super::processes::{Called, start_robot};
+use crate::process::{Process, watch_robot};
 use crate::relay::{Relay, RelayConfig};
 
 /// Serves until Ctrl-C.

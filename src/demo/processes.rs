@@ -2,25 +2,17 @@
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::process::Stdio;
-use std::time::Duration;
 
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
-use serde::de::DeserializeOwned;
 use telemime_endpoint::{HostClock, Identity};
 use telemime_operator::cli::Event as Operator;
 use telemime_robot::cli::Event as Robot;
-use tokio::io::{AsyncBufReadExt, BufReader, Lines};
-use tokio::process::{Child, ChildStdout, Command};
 use tokio::sync::watch;
-use tokio::time::timeout;
 
 use super::{Args, Material};
+use crate::process::{Process, flag, listening, text, watch_robot};
 use crate::relay::{Passage, Relay, RelayConfig};
-
-/// A process that is asked to end gets this long before it is killed.
-const GRACE: Duration = Duration::from_secs(5);
 
 /// What a run leaves behind.
 pub(super) struct Run {
@@ -31,77 +23,6 @@ pub(super) struct Run {
     pub(super) ticks: PathBuf,
     /// What was learned.
     pub(super) skill: PathBuf,
-}
-
-pub(super) struct Process {
-    name: &'static str,
-    child: Child,
-    lines: Lines<BufReader<ChildStdout>>,
-}
-
-impl Process {
-    /// Starts this very program as one of the daemons. It ends when we do: its stdin is ours.
-    pub(super) fn start(name: &'static str, args: &[String]) -> anyhow::Result<Self> {
-        let program = std::env::current_exe().context("where is this program?")?;
-        let mut child = Command::new(program)
-            .arg(name)
-            .args(args)
-            .args(["--json", "--follow-stdin"])
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .kill_on_drop(true)
-            .spawn()
-            .with_context(|| format!("cannot start the {name}"))?;
-        let stdout = child.stdout.take().context("no pipe")?;
-        Ok(Self {
-            name,
-            child,
-            lines: BufReader::new(stdout).lines(),
-        })
-    }
-
-    /// The next event; `None` once the process has closed its stdout.
-    pub(super) async fn next<E: DeserializeOwned>(&mut self) -> anyhow::Result<Option<E>> {
-        let Some(line) = self.lines.next_line().await? else {
-            return Ok(None);
-        };
-        let event =
-            serde_json::from_str(&line).with_context(|| format!("{} says: {line}", self.name))?;
-        Ok(Some(event))
-    }
-
-    /// Closes its stdin, which ends it, and collects what it still says.
-    pub(super) async fn finish<E: DeserializeOwned>(
-        mut self,
-        events: &mut Vec<E>,
-    ) -> anyhow::Result<()> {
-        drop(self.child.stdin.take());
-        let rest = async {
-            while let Some(event) = self.next().await? {
-                events.push(event);
-            }
-            anyhow::Ok(self.child.wait().await?)
-        };
-        match timeout(GRACE, rest).await {
-            Ok(done) => done.map(|_| ()),
-            Err(_) => {
-                self.child.kill().await?;
-                bail!(
-                    "the {} did not end when asked to, and was killed",
-                    self.name
-                )
-            }
-        }
-    }
-}
-
-fn text(path: &Path) -> String {
-    path.to_string_lossy().into_owned()
-}
-
-/// Flag and value, if there is a value.
-fn flag<T: ToString>(name: &str, value: Option<T>) -> Vec<String> {
-    value.map_or_else(Vec::new, |v| vec![name.to_owned(), v.to_string()])
 }
 
 /// A robot that listens, and what an operator needs to call it.
@@ -242,31 +163,6 @@ pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> any
         ticks,
         skill,
     })
-}
-
-async fn listening(robot: &mut Process, events: &mut Vec<Robot>) -> anyhow::Result<SocketAddr> {
-    let first = timeout(Duration::from_secs(60), robot.next())
-        .await
-        .context("the robot does not start")??;
-    let Some(event) = first else {
-        bail!("the robot did not start; it says why above")
-    };
-    events.push(event);
-    match events.last() {
-        Some(Robot::Listening { addr, .. }) => Ok(*addr),
-        other => bail!("the robot begins with {other:?}"),
-    }
-}
-
-/// Ends only if the robot does, which it should not.
-pub(super) async fn watch_robot(
-    robot: &mut Process,
-    events: &mut Vec<Robot>,
-) -> anyhow::Result<()> {
-    while let Some(event) = robot.next().await? {
-        events.push(event);
-    }
-    bail!("the robot ended before the operator; it says why above")
 }
 
 async fn watch_operator(

@@ -32,14 +32,10 @@ struct Path<'a> {
 
 impl Path<'_> {
     fn send(&mut self, at_s: f64, bytes: usize) -> Option<f64> {
-        // The link's own clock begins at 0, before the hand's rest.
-        let now_ns = ((at_s + REST_S) * 1e9).round() as i64;
-        let fate = self.link.send(now_ns, bytes);
+        let fate = self.link.send((at_s * 1e9).round() as i64, bytes);
         let cut = |(from_s, to_s)| (from_s..to_s).contains(&at_s);
         let arrived_s = match fate.arrival_ns() {
-            Some(at_ns) if !self.settings.outage_s.is_some_and(cut) => {
-                Some(at_ns as f64 * 1e-9 - REST_S)
-            }
+            Some(at_ns) if !self.settings.outage_s.is_some_and(cut) => Some(at_ns as f64 * 1e-9),
             _ => None,
         };
         self.packets.push(Packet {
@@ -76,8 +72,10 @@ pub(super) fn drive(
         tip_orientation: Default::default(),
     };
     let lag_s = rig.lag_s();
+    let mut link = Link::new(settings.up.clone(), seed);
+    link.begin_at(0);
     let mut path = Path {
-        link: Link::new(settings.up.clone(), seed).beginning_at(0),
+        link,
         settings,
         packets: Vec::new(),
     };
@@ -157,16 +155,17 @@ pub(super) fn drive(
             turn: followed.turn.as_ref().map(|turn| turn.at(*t_s)),
             jerk_m_s3: *jerk_m_s3,
             limited: *limited,
+            follows: true,
             age_s,
         });
     Trace {
         ticks: ticks.collect(),
-        packets: path.packets,
+        packets: Some(path.packets),
         outcome: Outcome::Followed,
         messages,
         knots,
         scale: mapping.scale,
-        heard_s: Vec::new(),
+        heard_s: None,
         simulated_s: end_s + REST_S,
     }
 }

@@ -5,9 +5,9 @@ use std::rc::Rc;
 
 use telemime_endpoint::Mono;
 use telemime_operator::cli::Axes;
-use telemime_operator::daemon::Notice;
+use telemime_operator::daemon::{DaemonError, Notice};
 use telemime_operator::demonstration::{Demonstration, Sample};
-use telemime_operator::session::{Event, SessionConfig};
+use telemime_operator::session::{Counters, Event, SessionConfig};
 use telemime_operator::task::{self, Recording, Task};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::RobotState;
@@ -20,7 +20,10 @@ use super::trace::{Outcome, Packet, Tick, Trace};
 use crate::ground::{Operator, Pair, PairError, Passage, run_virtual};
 
 /// The hand rests this long before a recording begins, s: enough for an engage over any link of the plans.
-const REST_S: f64 = 3.0;
+pub(super) const REST_S: f64 = 3.0;
+
+/// Why nothing was driven over a link that not even the handshake gets through.
+pub(super) const UNREACHED: &str = "the robot was not reached";
 
 /// The other way's chances.
 const DOWN_STREAM: u64 = 0x9e37_79b9_7f4a_7c15;
@@ -64,19 +67,20 @@ pub(super) fn session(settings: &Settings, axes: Axes) -> SessionConfig {
 #[derive(Default)]
 struct Heard {
     ready: Option<Stamp>,
-    telemetry: Vec<Stamp>,
+    /// When it came, and when it was true by the robot's clock, if that was known.
+    telemetry: Vec<(Stamp, Option<Stamp>)>,
 }
 
 /// What is known when it is over.
 struct Raw {
     reports: Vec<Report>,
     passages: Vec<Passage>,
-    heard_ns: Vec<i64>,
+    heard_ns: Vec<(i64, Option<i64>)>,
     zero_ns: Option<i64>,
     up_from: std::net::SocketAddr,
     /// When the common clock showed 0.
     origin: tokio::time::Instant,
-    counters: telemime_operator::session::Counters,
+    counters: Counters,
     outcome: task::Outcome,
     simulated_s: f64,
 }
@@ -94,12 +98,12 @@ pub(super) fn drive(
     let raw = run_virtual(scenario(settings, subject, rig, axes, seed, samples))??;
     let trace = |ticks, outcome, scale| Trace {
         ticks,
-        packets: Vec::new(),
+        packets: None,
         outcome,
-        messages: raw.counters.messages,
-        knots: raw.counters.knots,
+        messages: raw.counters.messages - raw.counters.rest_messages,
+        knots: raw.counters.knots - raw.counters.rest_knots,
         scale,
-        heard_s: Vec::new(),
+        heard_s: None,
         simulated_s: raw.simulated_s,
     };
     let why = match &raw.outcome {
@@ -119,14 +123,11 @@ pub(super) fn drive(
         bytes: p.len_bytes,
         arrived_s: p.arrives.map(instant_s),
     });
-    let packets = packets.collect();
-    let heard_s = raw.heard_ns.iter().map(|&ns| time_s(ns)).collect();
-    let engaged: Vec<&Report> = raw
-        .reports
-        .iter()
-        .skip_while(|r| r.engagement.number == 0)
-        .collect();
-    let Some(first) = engaged.first() else {
+    let packets = Some(packets.collect());
+    let heard = raw.heard_ns.iter();
+    let heard_s = heard.map(|&(at, of)| (time_s(at), of.map(time_s)));
+    let heard_s = Some(heard_s.collect());
+    let Some(engaged) = raw.reports.iter().position(|r| r.engagement.number > 0) else {
         let trace = trace(Vec::new(), Outcome::NotDriven(why), f64::NAN);
         return Ok(Trace {
             packets,
@@ -135,9 +136,12 @@ pub(super) fn drive(
         });
     };
     let follows = |r: &Report| matches!(r.state, RobotState::Engaged | RobotState::Coasting);
-    let mapping = first.mapping;
+    let mapping = raw.reports[engaged].mapping;
     let mut clamps = 0;
-    let ticks = engaged.iter().map(|r| {
+    // An arm that waits to be engaged while the recording runs errs like any other.
+    let begun = raw.reports.iter().position(|r| time_s(r.at.0) >= 0.0);
+    let from = begun.map_or(engaged, |begun| begun.min(engaged));
+    let ticks = raw.reports[from..].iter().map(|r| {
         let limited = r.clamps > std::mem::replace(&mut clamps, r.clamps);
         Tick {
             t_s: time_s(r.at.0),
@@ -145,11 +149,12 @@ pub(super) fn drive(
             turn: mapping.unorient(&r.orientation),
             jerk_m_s3: r.jerk_m_s3,
             limited,
+            follows: follows(r),
             age_s: follows(r).then_some(r.age_s),
         }
     });
     let ticks: Vec<_> = ticks.collect();
-    let stopped = engaged.iter().find(|r| !follows(r));
+    let stopped = raw.reports[engaged..].iter().find(|r| !follows(r));
     let outcome = match stopped {
         Some(r) if time_s(r.at.0) < end_s => {
             Outcome::Stopped(time_s(r.at.0), format!("{:?}", r.cause))
@@ -193,25 +198,30 @@ async fn scenario(
     } = operator;
     let heard: Rc<RefCell<Heard>> = Rc::default();
     let log = heard.clone();
+    let (latency_s, session_zero) = (settings.input_latency_s, pair.to_mono(Stamp::ZERO));
+    // When the recording's time is 0, known from when the robot is ready.
+    let zero =
+        move |ready: Stamp| Mono(ready.0 + session_zero.0).offset_by_secs(REST_S - latency_s);
+    let network = pair.network.clone();
     let listening = tokio::task::spawn_local(async move {
         while let Some(notice) = notices.recv().await {
             let mut heard = log.borrow_mut();
             match notice {
-                Notice::Event(at, Event::Ready) => {
-                    heard.ready.get_or_insert(at);
+                Notice::Event(at, Event::Ready) if heard.ready.is_none() => {
+                    heard.ready = Some(at);
+                    network.begin(clock.instant(zero(at)));
                 }
-                Notice::Event(at, Event::Telemetry(_)) => heard.telemetry.push(at),
+                Notice::Event(at, Event::Telemetry(told)) => {
+                    let of = (told.t_us != 0).then(|| Stamp(told.t_us.saturating_mul(1000)));
+                    heard.telemetry.push((at, of));
+                }
                 _ => {}
             }
         }
     });
     let cut = settings.outage_s.map(|(from_s, to_s)| {
         let (network, heard) = (pair.network.clone(), heard.clone());
-        let (latency_s, session_zero) = (settings.input_latency_s, pair.to_mono(Stamp::ZERO));
-        let zero = move || {
-            let ready = heard.borrow().ready?;
-            Some(Mono(ready.0 + session_zero.0).offset_by_secs(REST_S - latency_s))
-        };
+        let zero = move || heard.borrow().ready.map(zero);
         async move {
             let mut tick = tokio::time::interval(std::time::Duration::from_millis(1));
             for (at_s, down) in [(from_s, true), (to_s, false)] {
@@ -226,13 +236,22 @@ async fn scenario(
     let (summary, task) = (&mut done)
         .await
         .expect("the operator's task does not panic");
-    let summary = summary?;
+    let (counters, outcome) = match summary {
+        Ok(summary) => (summary.counters, summary.outcome),
+        Err(DaemonError::Unreachable { .. }) => {
+            let outcome = task::Outcome::Interrupted(UNREACHED.to_owned());
+            (Counters::default(), outcome)
+        }
+        Err(e) => return Err(e.into()),
+    };
     if let Some(cutting) = cutting {
         cutting.abort();
     }
     listening.abort();
     let heard = heard.borrow();
-    let heard_ns = heard.telemetry.iter().map(|at| pair.to_mono(*at).0);
+    let mono_ns = |at: Stamp| pair.to_mono(at).0;
+    let heard_ns = heard.telemetry.iter();
+    let heard_ns = heard_ns.map(|&(at, of)| (mono_ns(at), of.map(mono_ns)));
     Ok(Raw {
         reports: pair.robot.reports().clone(),
         passages: pair.network.logged(),
@@ -240,8 +259,8 @@ async fn scenario(
         zero_ns: task.zero().map(|zero| pair.to_mono(zero).0),
         up_from: own,
         origin,
-        counters: summary.counters,
-        outcome: summary.outcome,
+        counters,
+        outcome,
         simulated_s: began.elapsed().as_secs_f64(),
     })
 }

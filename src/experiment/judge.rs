@@ -3,6 +3,7 @@
 use nalgebra::Vector3;
 use telemime_operator::cli::Axes;
 use telemime_operator::demonstration::Demonstration;
+use telemime_operator::session::SessionConfig;
 use telemime_protocol::pose;
 
 use super::drive::{driven, from_zero, session};
@@ -33,8 +34,11 @@ const REACH: usize = 1000;
 /// A tip's reversal is sought until this long after the hand's, ms.
 const REVERSAL: usize = 400;
 
-/// At rest the tip goes no farther than this in a tenth of a second, m of the robot.
+/// At rest the tip is nearer than this to where it stays, m of the robot.
 const STILL_M: f64 = 1e-4;
+
+/// A stop that begins this long after the outage's end is another's, s: the last of the lease, and the arm's.
+const AFTER_S: f64 = 1.0;
 
 /// χ² with three degrees of freedom at 90 %.
 const CHI2_90: f64 = 6.251_388_631;
@@ -64,6 +68,9 @@ pub(super) fn judge(
         scale: Some(trace.scale).filter(|s| s.is_finite()),
         ..Figures::default()
     };
+    if let Outcome::NotDriven(_) = trace.outcome {
+        figures.followed = Some(0.0);
+    }
     wire(&mut figures, trace, end_s);
     prediction(&mut figures, settings, subject, d, axes);
     if let Some(outage_s) = settings.outage_s {
@@ -83,11 +90,7 @@ pub(super) fn judge(
     let wide: Vec<_> = (-(LATE as i64)..(n + EARLY) as i64).map(at).collect();
     let hand = &wide[LATE..LATE + n];
     figures.judged_s = Some(n as f64 * GRID_S);
-    let until_s = match &trace.outcome {
-        Outcome::Stopped(at_s, _) => *at_s,
-        Outcome::Followed | Outcome::NotDriven(_) => end_s,
-    };
-    let followed = judged.iter().filter(|t| t.t_s < until_s).count();
+    let followed = judged.iter().filter(|t| t.follows).count();
     figures.followed = Some(followed as f64 / n as f64);
     let errors = tip.iter().zip(hand).map(|(a, b)| (a - b).norm());
     if let Some(error) = Spread::of(errors) {
@@ -141,8 +144,13 @@ pub(super) fn judge(
 
 /// While the recording lasts.
 fn wire(figures: &mut Figures, trace: &Trace, end_s: f64) {
+    figures.messages_per_s = Some(f64::from(trace.messages) / end_s);
+    figures.knots_per_s = Some(f64::from(trace.knots) / end_s);
+    let Some(packets) = &trace.packets else {
+        return;
+    };
     let during = |up: bool| {
-        let of = trace.packets.iter().filter(move |p| p.up == up);
+        let of = packets.iter().filter(move |p| p.up == up);
         of.filter(|p| (0.0..end_s).contains(&p.sent_s))
     };
     let rates = |up: bool| {
@@ -151,8 +159,6 @@ fn wire(figures: &mut Figures, trace: &Trace, end_s: f64) {
     };
     (figures.up_packets_per_s, figures.up_bytes_per_s) = rates(true);
     (figures.down_packets_per_s, figures.down_bytes_per_s) = rates(false);
-    figures.messages_per_s = Some(f64::from(trace.messages) / end_s);
-    figures.knots_per_s = Some(f64::from(trace.knots) / end_s);
     if let Some(passing) = Passing::of(during(true).map(|p| (p.sent_s, p.arrived_s))) {
         figures.delay_p50_s = Some(passing.delay_p50_s);
         figures.delay_p99_s = Some(passing.delay_p99_s);
@@ -186,7 +192,11 @@ fn prediction(
     };
     match settings.method {
         Method::Ours => {
-            let config = session(settings, axes);
+            // Here a sample is taken the moment it is valid.
+            let config = SessionConfig {
+                input_latency_s: 0.0,
+                ..session(settings, axes)
+            };
             let mut live = Live::new(&subject.skill, config, 0.0);
             for sample in d.samples() {
                 for said in live.take(sample) {
@@ -226,9 +236,17 @@ fn prediction(
 }
 
 fn outage(figures: &mut Figures, trace: &Trace, (from_s, to_s): (f64, f64), end_s: f64) {
-    let heard = trace.heard_s.iter().find(|t| **t >= to_s);
-    figures.reconnect_s = heard.map(|t| t - to_s);
-    if let Outcome::Stopped(..) = trace.outcome {
+    // What was sent before the outage may still come after it, and says nothing of the link's return; meanwhile nothing
+    // leaves. Telemetry that knows no time yet is a new session's.
+    let middle_s = 0.5 * (from_s + to_s);
+    let anew = |&&(at_s, of_s): &&(f64, Option<f64>)| {
+        at_s >= to_s && of_s.is_none_or(|of_s| of_s > middle_s)
+    };
+    let heard = trace.heard_s.iter().flatten().find(anew);
+    figures.reconnect_s = heard.map(|(at_s, _)| at_s - to_s);
+    if let Outcome::Stopped(at_s, _) = trace.outcome
+        && (from_s..to_s + AFTER_S).contains(&at_s)
+    {
         let since: Vec<_> = trace
             .ticks
             .iter()
@@ -244,7 +262,8 @@ fn outage(figures: &mut Figures, trace: &Trace, (from_s, to_s): (f64, f64), end_
             .rposition(|t| (t.tip_m - last.tip_m).norm() > still_m)
             .map_or(0, |i| i + 1);
         figures.stop_s = since.get(rest).map(|t| t.t_s - from_s);
-        figures.stop_m = Some((last.tip_m - first.tip_m).norm());
+        let way = since.iter().map(|t| (t.tip_m - first.tip_m).norm());
+        figures.stop_m = way.max_by(f64::total_cmp);
     }
 }
 
@@ -261,17 +280,24 @@ mod tests {
                 turn: None,
                 jerk_m_s3: 0.0,
                 limited: false,
+                follows: true,
                 age_s: None,
             }
         };
         Trace {
             ticks: (0..5000).map(tick).collect(),
-            packets: Vec::new(),
+            packets: Some(Vec::new()),
             outcome,
             messages: 10,
             knots: 20,
             scale: 0.1,
-            heard_s: vec![0.5, 2.9, 3.25],
+            // The third was sent before the link was cut.
+            heard_s: Some(vec![
+                (0.5, Some(0.45)),
+                (1.9, Some(1.85)),
+                (3.05, Some(1.95)),
+                (3.25, None),
+            ]),
             simulated_s: 5.0,
         }
     }
@@ -297,6 +323,20 @@ mod tests {
             5.0,
         );
         assert_eq!((figures.stop_s, figures.stop_m), (None, None));
+        // It had stopped before, or stopped long after: for another reason.
+        for at_s in [1.5, 4.5] {
+            let mut figures = Figures::default();
+            let other = trace(Outcome::Stopped(at_s, "Uncertain".into()), |t| t.min(at_s));
+            outage(&mut figures, &other, (2.0, 3.0), 5.0);
+            assert_eq!((figures.stop_s, figures.stop_m), (None, None));
+        }
+        // It goes 0.3 m on and comes back: it went 0.3 m.
+        let mut figures = Figures::default();
+        let back = trace(Outcome::Stopped(2.3, "LeaseOver".into()), |t| {
+            0.3 - (t.clamp(2.0, 2.6) - 2.3).abs()
+        });
+        outage(&mut figures, &back, (2.0, 3.0), 5.0);
+        assert!((figures.stop_m.unwrap() - 0.3).abs() < 1e-9);
     }
 
     #[test]
@@ -308,9 +348,8 @@ mod tests {
             bytes: 100,
             arrived_s: Some(sent_s + 0.1),
         };
-        run.packets = (-10..20)
-            .map(|i| packet(f64::from(i) * 0.5, i % 2 == 0))
-            .collect();
+        let packets = (-10..20).map(|i| packet(f64::from(i) * 0.5, i % 2 == 0));
+        run.packets = Some(packets.collect());
         let mut figures = Figures::default();
         wire(&mut figures, &run, 5.0);
         assert_eq!(figures.up_packets_per_s, Some(1.0));

@@ -1,4 +1,4 @@
-//! `telemime experiment`: a plan's runs on the virtual ground, repeatable to the byte.
+//! `telemime experiment`: a plan's runs, on the virtual ground repeatable to the byte, or in real time.
 
 mod baseline;
 mod drive;
@@ -8,6 +8,7 @@ mod judge;
 mod method;
 mod plan;
 mod plans;
+mod real;
 pub(crate) mod report;
 mod row;
 mod run;
@@ -23,7 +24,10 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 
+use method::Method;
 use plan::Plan;
+use real::Ground;
+pub(crate) use real::Missing;
 use run::{Timing, all, inputs, list, rigs};
 use store::{Found, Host, Manifest, Store};
 
@@ -49,7 +53,16 @@ pub(crate) struct Args {
     /// Only the I-th of N parts of the runs: for machines side by side.
     #[arg(long, value_name = "I/N", default_value_t)]
     shard: Shard,
-    /// Threads [default: all cores]; the results do not depend on it.
+    /// Where the daemons run; what they are held against is computed wherever that is.
+    #[arg(long, value_enum, default_value_t)]
+    ground: Ground,
+    /// Of every list of link seeds only the first N: a look at a large plan.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    seeds: Option<u16>,
+    /// Only the first N people.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    people: Option<u16>,
+    /// Threads [default: all cores, in real time one]; on the virtual ground the results do not depend on it.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
     /// Say how many runs there are, and of what, and do none.
@@ -135,11 +148,22 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         return Ok(());
     }
     let name = args.plan.as_deref().context("which plan?")?;
+    let mut plan = read(name)?;
+    let thinned = plan.thin(args.seeds.map(usize::from), args.people.map(usize::from));
+    let ours = plan.cells.iter().map(|c| &c.settings);
+    let ours = ours.filter(|s| s.method == Method::Ours);
+    ours.clone().try_for_each(|s| args.ground.fits(s))?;
+    args.ground.missing(ours)?;
+    // Runs in real time must not take each other's.
+    let threads = match (args.threads, args.ground) {
+        (Some(n), _) => usize::from(n),
+        (None, Ground::Virtual) => 0,
+        (None, Ground::Loopback | Ground::Netns) => 1,
+    };
     let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(args.threads.map_or(0, usize::from))
+        .num_threads(threads)
         .build()?;
-    let plan = read(name)?;
-    pool.install(|| execute(args, name, &plan))
+    pool.install(|| execute(args, name, &plan, &thinned))
 }
 
 fn read(name: &str) -> anyhow::Result<Plan> {
@@ -156,7 +180,7 @@ fn read(name: &str) -> anyhow::Result<Plan> {
     Ok(Plan::parse(name, &text, folder.unwrap_or(Path::new(".")))?)
 }
 
-fn execute(args: &Args, name: &str, plan: &Plan) -> anyhow::Result<()> {
+fn execute(args: &Args, name: &str, plan: &Plan, thinned: &str) -> anyhow::Result<()> {
     let rigs = rigs(plan)?;
     let learned = AtomicUsize::new(0);
     let subjects = subject::subjects(plan, |all| {
@@ -170,6 +194,9 @@ fn execute(args: &Args, name: &str, plan: &Plan) -> anyhow::Result<()> {
     let stem = Path::new(name).file_stem().unwrap_or_default();
     let out = args.out.clone().unwrap_or_else(|| {
         let mut folder = stem.to_owned();
+        if args.ground != Ground::Virtual {
+            folder.push(format!("-{}", args.ground));
+        }
         if of > 1 {
             folder.push(format!("-{part}-of-{of}"));
         }
@@ -194,6 +221,8 @@ fn execute(args: &Args, name: &str, plan: &Plan) -> anyhow::Result<()> {
         plan_sha256: plan.hash(),
         seed: plan.seed,
         runs: total,
+        ground: args.ground,
+        thinned: thinned.to_owned(),
         shard: args.shard.to_string(),
         inputs: inputs(plan, &subjects)?,
         version: env!("CARGO_PKG_VERSION").into(),
@@ -240,7 +269,8 @@ fn execute(args: &Args, name: &str, plan: &Plan) -> anyhow::Result<()> {
         bar.set_style(style);
     }
     let store = Mutex::new(store);
-    let result = all(plan, &rigs, &left, &store, || bar.inc(1));
+    bar.tick();
+    let result = all(args.ground, plan, &rigs, &left, &store, || bar.inc(1));
     bar.finish_and_clear();
     let (new, timing) = result?;
     rows.extend(new);

@@ -10,7 +10,7 @@ use telemime_operator::demonstration::PersonPattern;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use super::factor::{FACTORS, LINK, Settings, Texts, index, seen_by};
+use super::factor::{FACTORS, LINK, Settings, Texts, UNUSED, index, of, seen_by};
 
 /// More runs than this are a slip.
 const MOST_RUNS: usize = 1_000_000;
@@ -56,6 +56,8 @@ pub(super) struct Motion {
     /// Most recordings of a person that a skill is learned from.
     pub(super) learn_from: usize,
     pub(super) axes: Axes,
+    /// Only so many subjects.
+    pub(super) most: Option<usize>,
 }
 
 impl Default for Motion {
@@ -70,6 +72,7 @@ impl Default for Motion {
             persons: PersonPattern::default(),
             learn_from: 3,
             axes: Axes::Kinect,
+            most: None,
         }
     }
 }
@@ -125,6 +128,32 @@ impl Plan {
     /// Reads the text of a plan that is called `plan`; paths in it begin at `folder`.
     pub(super) fn parse(plan: &str, text: &str, folder: &Path) -> Result<Self, PlanError> {
         Reader { plan, text, folder }.plan()
+    }
+
+    /// Leaves all but the first link seeds, and the first people, out; the flags that say so: none if nothing is left out.
+    pub(super) fn thin(&mut self, seeds: Option<usize>, people: Option<usize>) -> String {
+        let mut said = Vec::new();
+        let seed = |cell: &Cell| of(&cell.texts, "link_seed").to_owned();
+        if let Some(most) = seeds {
+            let mut known: Vec<String> = Vec::new();
+            for cell in &self.cells {
+                let text = seed(cell);
+                if text != UNUSED && !known.contains(&text) {
+                    known.push(text);
+                }
+            }
+            if most < known.len() {
+                said.push(format!("--seeds {most}"));
+                known.truncate(most);
+                self.cells
+                    .retain(|c| seed(c) == UNUSED || known.contains(&seed(c)));
+            }
+        }
+        if let Some(most) = people {
+            self.motion.most = Some(most);
+            said.push(format!("--people {most}"));
+        }
+        said.join(" ")
     }
 
     /// SHA-256 of the text, in hexadecimal digits.
@@ -191,7 +220,11 @@ impl Reader<'_> {
             crossings.push(base);
         }
         Ok(Plan {
-            title: title.unwrap_or_else(|| self.plan.to_owned()),
+            // From wherever it is read, the results are the same.
+            title: title.unwrap_or_else(|| {
+                let name = Path::new(self.plan).file_name();
+                name.map_or_else(String::new, |name| name.to_string_lossy().into_owned())
+            }),
             seed,
             motion,
             cells: self.cross(&crossings)?,

@@ -12,6 +12,8 @@ pub(super) struct Row {
     pub(super) id: String,
     pub(super) subject: String,
     pub(super) person: String,
+    /// Where it ran; what is computed ran on the virtual one.
+    pub(super) ground: String,
     pub(super) texts: Texts,
     /// `followed`, `stopped: WHY` or `not driven: WHY`.
     pub(super) outcome: String,
@@ -19,7 +21,7 @@ pub(super) struct Row {
 }
 
 /// Columns before the factors, and after them before the figures.
-const BEFORE: [&str; 4] = ["run", "id", "subject", "person"];
+const BEFORE: [&str; 5] = ["run", "id", "subject", "person", "ground"];
 const AFTER: &str = "outcome";
 
 impl Row {
@@ -38,6 +40,7 @@ impl Row {
             self.id.clone(),
             self.subject.clone(),
             self.person.clone(),
+            self.ground.clone(),
         ];
         fields.extend(self.texts.iter().cloned());
         fields.push(self.outcome.clone());
@@ -66,6 +69,7 @@ impl Row {
             id: head[1].to_owned(),
             subject: head[2].to_owned(),
             person: head[3].to_owned(),
+            ground: head[4].to_owned(),
             texts: std::array::from_fn(|n| factors[n].to_owned()),
             outcome: rest[0].to_owned(),
             figures: Figures::from_values(values),
@@ -97,6 +101,7 @@ mod tests {
             id: "0123456789ab".into(),
             subject: "swing, \"left\"".into(),
             person: "7".into(),
+            ground: "loopback".into(),
             texts: std::array::from_fn(|n| FACTORS[n].default[0].to_owned()),
             outcome: "stopped: LeaseOver".into(),
             figures: Figures {

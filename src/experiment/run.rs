@@ -13,6 +13,7 @@ use super::factor::{FACTORS, Settings};
 use super::judge::{Moment, judge};
 use super::method::Method;
 use super::plan::{Cell, Plan, hex};
+use super::real::{self, Ground, RealError};
 use super::row::Row;
 use super::store::{Store, StoreError};
 use super::subject::{Subject, SubjectError};
@@ -31,6 +32,8 @@ pub(super) enum RunError {
     Store(#[from] StoreError),
     #[error("run {id}: {source}")]
     Ground { id: String, source: PairError },
+    #[error("run {id}: {source}")]
+    Real { id: String, source: RealError },
 }
 
 /// One run to do.
@@ -138,9 +141,10 @@ pub(super) struct Timing {
     pub(super) ours_computed_s: f64,
 }
 
-/// Does `runs`, each on one thread; the results do not depend on how many there are. `progress` hears of each one
-/// done, from any thread.
+/// Does `runs`, each on one thread, ours on `ground`; on the virtual one the results do not depend on how many there are.
+/// `progress` hears of each one done, from any thread.
 pub(super) fn all(
+    ground: Ground,
     plan: &Plan,
     rigs: &Rigs,
     runs: &[Run<'_>],
@@ -152,7 +156,7 @@ pub(super) fn all(
         .par_iter()
         .map(|run| {
             let since = Instant::now();
-            let (row, moments, simulated_s) = one(plan, rigs, run)?;
+            let (row, moments, simulated_s) = one(ground, plan, rigs, run)?;
             let computed_s = since.elapsed().as_secs_f64();
             let mut store = store.lock().expect("no code panics while it writes");
             if run.shown {
@@ -185,17 +189,24 @@ pub(super) fn all(
     Ok((rows, timing))
 }
 
-fn one(plan: &Plan, rigs: &Rigs, run: &Run<'_>) -> Result<(Row, Vec<Moment>, f64), RunError> {
+fn one(
+    ground: Ground,
+    plan: &Plan,
+    rigs: &Rigs,
+    run: &Run<'_>,
+) -> Result<(Row, Vec<Moment>, f64), RunError> {
     let (settings, subject) = (&run.cell.settings, run.subject);
     let rig = &rigs[&rig_key(settings)];
     let (axes, seed) = (plan.motion.axes, chances(plan, subject, settings));
-    let trace = if settings.method == Method::Ours {
-        drive::drive(settings, subject, rig, axes, seed).map_err(|source| {
-            let id = run.id.clone();
-            RunError::Ground { id, source }
-        })?
-    } else {
-        baseline::drive(settings, subject, rig, axes, seed)
+    let id = || run.id.clone();
+    let ours = settings.method == Method::Ours;
+    let ground = if ours { ground } else { Ground::Virtual };
+    let trace = match ground {
+        _ if !ours => baseline::drive(settings, subject, rig, axes, seed),
+        Ground::Virtual => drive::drive(settings, subject, rig, axes, seed)
+            .map_err(|source| RunError::Ground { id: id(), source })?,
+        Ground::Loopback | Ground::Netns => real::drive(ground, settings, subject, axes, seed)
+            .map_err(|source| RunError::Real { id: id(), source })?,
     };
     let (figures, moments) = judge(settings, subject, &trace, axes);
     let row = Row {
@@ -203,6 +214,7 @@ fn one(plan: &Plan, rigs: &Rigs, run: &Run<'_>) -> Result<(Row, Vec<Moment>, f64
         id: run.id.clone(),
         subject: subject.name.clone(),
         person: subject.person.clone(),
+        ground: ground.name().to_owned(),
         texts: run.cell.texts.clone(),
         outcome: match &trace.outcome {
             Outcome::Followed => "followed".to_owned(),

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::judge::Moment;
+use super::real::Ground;
 use super::row::{Row, line};
 
 /// What every experiment folder holds.
@@ -29,12 +30,26 @@ pub(super) struct Manifest {
     pub(super) seed: u64,
     /// Runs of the whole plan.
     pub(super) runs: usize,
+    /// Where ours ran.
+    pub(super) ground: Ground,
+    /// The flags that left a part of the plan out; empty if nothing was.
+    pub(super) thinned: String,
     /// Which of how many shards; `1/1` is all, or shards merged.
     pub(super) shard: String,
     /// Recordings, arms and traces, by the paths the plan gives them, with their SHA-256.
     pub(super) inputs: BTreeMap<String, String>,
     pub(super) version: String,
     pub(super) host: Host,
+}
+
+impl Manifest {
+    /// How much of the plan, and on which ground.
+    pub(super) fn part(&self) -> String {
+        match self.thinned.as_str() {
+            "" => format!("whole, {}", self.ground),
+            thinned => format!("{thinned}, {}", self.ground),
+        }
+    }
 }
 
 /// Where it ran: sine and cosine are the platform's.
@@ -138,6 +153,7 @@ impl Store {
                 ("plan", &there.plan_sha256, &manifest.plan_sha256),
                 ("shard", &there.shard, &manifest.shard),
                 ("version", &there.version, &manifest.version),
+                ("part of the plan", &there.part(), &manifest.part()),
             ] {
                 if a != b {
                     return Err(other(what, a, b));
@@ -251,6 +267,7 @@ pub(super) fn merge(out: &Path, dirs: &[PathBuf]) -> Result<usize, StoreError> {
         for (what, a, b) in [
             ("plan", &manifest.plan_sha256, &whole.plan_sha256),
             ("version", &manifest.version, &whole.version),
+            ("part of the plan", &manifest.part(), &whole.part()),
         ] {
             if a != b {
                 return Err(StoreError::Other {

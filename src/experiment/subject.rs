@@ -64,11 +64,12 @@ pub(super) fn subjects(
     plan: &Plan,
     progress: impl Fn(usize) + Sync,
 ) -> Result<Vec<Subject>, SubjectError> {
-    let materials = if plan.motion.folders.is_empty() {
+    let mut materials = if plan.motion.folders.is_empty() {
         generated(plan)?
     } else {
         recorded(&plan.motion, plan.seed)?
     };
+    materials.truncate(plan.motion.most.unwrap_or(usize::MAX));
     let all = materials.len();
     materials
         .into_par_iter()

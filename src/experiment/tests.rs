@@ -26,6 +26,9 @@ fn args(plan: &Path, out: &Path, shard: &str, threads: u16) -> Args {
         out: Some(out.to_owned()),
         shard: shard.parse().unwrap(),
         threads: Some(threads),
+        ground: Ground::Virtual,
+        seeds: None,
+        people: None,
         dry_run: false,
         list: false,
         print: None,
@@ -150,6 +153,7 @@ fn the_same_plan_gives_the_same_bytes_on_any_number_of_threads_in_parts_and_inte
         assert!(!names.contains(fetched), "{fetched}");
     }
     assert!(html.contains("<h1>A &amp; B</h1>") && !html.contains("NaN"));
+    assert!(html.contains("<h2>Outages</h2>") && html.contains("<td>1 of 1 run</td>"));
     for chart in [
         "delay-on-model",
         "delay-off-model",
@@ -180,4 +184,54 @@ fn a_shard_is_written_as_a_fraction() {
     for wrong in ["0/3", "4/3", "3", "a/b", "1/0"] {
         assert!(wrong.parse::<Shard>().is_err(), "{wrong}");
     }
+}
+
+/// What everybody's packets meet, at the hand's own time: ours after a handshake and three seconds of rest, a baseline after
+/// one and none.
+#[test]
+fn whoever_follows_meets_the_same_link_at_the_same_moment_of_the_hand() {
+    let scratch = tempfile::tempdir().unwrap();
+    let series = "t_s,delay_ms\n0,10\n1,60\n2,30\n3,20\n";
+    std::fs::write(scratch.path().join("series.csv"), series).unwrap();
+    let plan = "[motion]\npeople = 1\nperformances = 2\n[factors]\nmotion = \"on-model\"\nmethod = [\"ours\", \"hold\", \"kalman\"]\n\
+                link = [\"delay 20ms outage 2s..2.4s every 3s\", \"trace series.csv\"]\ninput_latency = [\"0ms\", \"50ms\"]\n";
+    let plan = Plan::parse("moments", plan, scratch.path()).unwrap();
+    let subjects = subject::subjects(&plan, |_| ()).unwrap();
+    let rigs = rigs(&plan).unwrap();
+    let rig = rigs.values().next().unwrap();
+    let mut kinds = std::collections::BTreeSet::new();
+    for cell in &plan.cells {
+        let (settings, axes) = (&cell.settings, plan.motion.axes);
+        let trace = if settings.method == method::Method::Ours {
+            drive::drive(settings, &subjects[0], rig, axes, 7).unwrap()
+        } else {
+            baseline::drive(settings, &subjects[0], rig, axes, 7)
+        };
+        let packets = trace.packets.unwrap();
+        let during: Vec<_> = packets
+            .iter()
+            .filter(|p| (0.0..9.0).contains(&p.sent_s))
+            .collect();
+        assert!(during.len() > 50);
+        let mut met = [0; 2];
+        for p in during {
+            let out = (2.0..2.4).contains(&p.sent_s.rem_euclid(3.0)) && p.sent_s >= 2.0;
+            let late_s = match settings.up.trace {
+                None => (!out).then_some(0.02),
+                Some(_) => Some([0.01, 0.06, 0.03, 0.02][p.sent_s as usize % 4]),
+            };
+            met[usize::from(late_s == Some(0.02) || late_s == Some(0.06))] += 1;
+            let right = match (late_s, p.arrived_s) {
+                (Some(late_s), Some(at_s)) => (at_s - p.sent_s - late_s).abs() < 1e-6,
+                (None, None) => true,
+                _ => false,
+            };
+            // The edge itself is a rounding's.
+            let edge = (p.sent_s * 5.0 - (p.sent_s * 5.0).round()).abs() < 1e-6;
+            assert!(right || edge, "{} {p:?}", settings.method);
+        }
+        assert!(met.iter().all(|n| *n > 0), "{met:?}");
+        kinds.insert(cell.texts.to_vec());
+    }
+    assert_eq!(kinds.len(), 12);
 }

@@ -13,6 +13,8 @@ pub(super) struct Tick {
     pub(super) jerk_m_s3: f64,
     /// Whether a limit acted.
     pub(super) limited: bool,
+    /// Whether the arm is led, be it by an old message.
+    pub(super) follows: bool,
     /// Of what the arm follows, s; none where it follows nothing.
     pub(super) age_s: Option<f64>,
 }
@@ -45,17 +47,18 @@ pub(super) enum Outcome {
 pub(super) struct Trace {
     /// In order of time.
     pub(super) ticks: Vec<Tick>,
-    /// In the order they were sent.
-    pub(super) packets: Vec<Packet>,
+    /// In the order they were sent; none where nobody saw them.
+    pub(super) packets: Option<Vec<Packet>>,
     pub(super) outcome: Outcome,
-    /// Motion messages sent.
+    /// Motion messages sent while the recording lasts.
     pub(super) messages: u32,
-    /// Checkpoints of the path made, or of the plan sent.
+    /// Checkpoints of the path made meanwhile, or of the plan sent.
     pub(super) knots: u32,
     /// Tip metres per hand metre.
     pub(super) scale: f64,
-    /// When the operator heard from the robot, s of the recording.
-    pub(super) heard_s: Vec<f64>,
-    /// How long it ran, s.
+    /// When the operator heard from the robot, and when that was true (as far as is known), s of the recording; none where
+    /// it does not say.
+    pub(super) heard_s: Option<Vec<(f64, Option<f64>)>>,
+    /// How long it ran, s: on a virtual clock, or in truth.
     pub(super) simulated_s: f64,
 }

@@ -6,5 +6,5 @@ mod pair;
 mod tap;
 
 pub use net::{Network, Passage, Socket};
-pub use pair::{Operator, Pair, PairError, Robot, run_virtual};
+pub use pair::{Operator, PATIENCE, Pair, PairError, Robot, run_virtual};
 pub use tap::{Told, Watcher};

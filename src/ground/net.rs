@@ -126,6 +126,13 @@ impl Network {
         state.links.insert((from, to), link);
     }
 
+    /// Every link begins then, now or soon: outages and traces count from there ([`Link::begin_at`]).
+    pub fn begin(&self, at: Instant) {
+        let mut state = self.state();
+        let at_ns = (at - state.epoch).as_nanos() as i64;
+        state.links.values_mut().for_each(|l| l.begin_at(at_ns));
+    }
+
     /// Cuts every link, or restores them. Packets already on their way arrive.
     pub fn set_down(&self, down: bool) {
         self.state().down = down;

@@ -54,6 +54,9 @@ pub enum PairError {
 /// Not the robot's clock: the operators' session clock is an hour and a half off.
 const SESSION_ZERO: Mono = Mono(-5_400_000_000_000);
 
+/// Operators give up when they have not reached the robot within this time.
+pub const PATIENCE: Duration = Duration::from_secs(5);
+
 /// Hosts from here on are where operators go whose address has vanished.
 const SPARE: u8 = 128;
 
@@ -530,7 +533,7 @@ impl Pair {
             recogniser: None,
             config,
             learning: self.learning.clone(),
-            patience: Duration::from_secs(5),
+            patience: PATIENCE,
             shown: None,
         };
         let (quit, quit_rx) = watch::channel(false);

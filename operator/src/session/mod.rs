@@ -288,6 +288,10 @@ impl Session {
         if sample.resting {
             self.counters.rest_samples += 1;
         } else {
+            if self.counters.samples == 0 && self.counters.rest_samples > 0 {
+                self.counters.rest_messages = self.counters.messages;
+                self.counters.rest_knots = self.counters.knots;
+            }
             self.counters.samples += 1;
         }
         self.counters.knots += mirror.take(&sample, taken, hand, skill);

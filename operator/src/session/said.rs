@@ -77,8 +77,12 @@ pub struct Counters {
     pub rest_samples: u32,
     /// Motions and goes sent, from that request on.
     pub messages: u32,
+    /// Those of them that were sent before the first sample that is not at rest.
+    pub rest_messages: u32,
     /// Path knots made.
     pub knots: u32,
+    /// Those of them that were made before the first sample that is not at rest.
+    pub rest_knots: u32,
     /// Samples replaced by their prediction, and not taken back.
     pub glitches: u32,
     /// Datagrams dropped.
@@ -91,7 +95,9 @@ impl Counters {
         self.samples += other.samples;
         self.rest_samples += other.rest_samples;
         self.messages += other.messages;
+        self.rest_messages += other.rest_messages;
         self.knots += other.knots;
+        self.rest_knots += other.rest_knots;
         self.glitches += other.glitches;
         self.dropped += other.dropped;
     }

@@ -139,6 +139,8 @@ pub struct Link {
     counter: u32,
     slot: SlotState,
     cursor: Cursor,
+    /// Whole rounds of a schedule before the beginning, so that it is under way then.
+    lead_ns: i64,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -149,6 +151,9 @@ struct SlotState {
     packets: i64,
     bytes: i64,
 }
+
+/// A schedule is under way for at least this long before a beginning that is set anew.
+const LEAD_NS: i64 = 60_000_000_000;
 
 fn ns(seconds: f64) -> i64 {
     (seconds * 1e9).round() as i64
@@ -183,6 +188,7 @@ impl Link {
                 bytes: 0,
             },
             cursor: Cursor::default(),
+            lead_ns: 0,
             config,
         }
     }
@@ -192,6 +198,18 @@ impl Link {
     pub fn beginning_at(mut self, origin_ns: i64) -> Self {
         self.origin_ns = Some(origin_ns);
         self
+    }
+
+    /// Sets anew when it began, ns, or is to begin: outages and traces count from then, and a trace begins anew. What is
+    /// sent before meets the end of the trace, which loops, and none of the outages. Chances, queue and bottleneck go on.
+    pub fn begin_at(&mut self, origin_ns: i64) {
+        self.origin_ns = Some(origin_ns);
+        self.cursor = Cursor::default();
+        let recording = self.config.trace.as_ref().map(Trace::recording);
+        if let Some(Recording::Opportunities { period_ns, .. }) = recording {
+            let period_ns = *period_ns;
+            self.lead_ns = period_ns * (LEAD_NS / period_ns + 1);
+        }
     }
 
     /// What the link is set to.
@@ -335,7 +353,7 @@ impl Link {
         };
         let mut due_ns = now_ns + delay_ns;
         if let Some(Recording::Opportunities { at_ns, period_ns }) = recording {
-            let origin_ns = now_ns - since_ns;
+            let origin_ns = now_ns - since_ns - self.lead_ns;
             let from_ns = (due_ns.max(self.last_ns).max(now_ns) - origin_ns).max(0);
             due_ns = origin_ns + self.cursor.leave(at_ns, *period_ns, from_ns, len);
         }

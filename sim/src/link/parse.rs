@@ -584,16 +584,19 @@ fn time(option: &'static str, word: &str) -> Result<f64, ParseLinkError> {
     })
 }
 
-/// A share with its per cent sign, without which tc and everybody else disagree by a factor of a hundred.
+/// A share: a number with its per cent sign, or, as tc reads it, without; below 1 that may have been meant for a fraction, and
+/// is refused.
 fn share(option: &'static str, word: &str) -> Result<Probability, ParseLinkError> {
-    let percent = number_with_unit(word, &[("%", 1.0)]).filter(|p| *p <= 100.0);
+    let bare = word.parse::<f64>().ok();
+    let percent = bare.filter(|p| *p >= 1.0 || *p == 0.0);
+    let percent = percent.or_else(|| number_with_unit(word, &[("%", 1.0)]));
+    let percent = percent.filter(|p| (0.0..=100.0).contains(p));
     percent.map(|p| Probability::of(p / 100.0)).ok_or_else(|| {
-        let bare = word.parse::<f64>().is_ok();
         value(
             option,
             word,
-            if bare {
-                "a share needs its per cent sign (tc alone would read per cent, others a fraction): write for example 1%"
+            if bare.is_some_and(|p| p < 1.0) {
+                "is it a fraction, or per cent as tc would read it? write 1%, or 0.01%"
             } else {
                 "not a share from 0% to 100%: write for example 1%"
             },

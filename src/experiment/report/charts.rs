@@ -2,6 +2,7 @@
 
 use super::group::Group;
 use super::view::{Moment, View, called, colour, delay_s, rate_bit_s};
+use crate::experiment::row::Row;
 use crate::figure::{BLACK, Figure, GREY, Layer, Panel, Shape};
 use crate::measure::principal_axis;
 
@@ -84,7 +85,7 @@ fn course_over(
 }
 
 fn by_delay(view: &View<'_>, (motion, words): (&str, &str)) -> Option<Chart> {
-    if view.delays().len() < 2 {
+    if view.delays().len() < 2 || !view.differ_by_delay() {
         return None;
     }
     let ms = |g: &Group<'_>| delay_s(g).map(|s| s * 1e3);
@@ -142,6 +143,21 @@ fn by_rate(view: &View<'_>, (motion, words): (&str, &str)) -> Option<Chart> {
         layers,
     )?;
     panel.doubling = true;
+    let missing = |row: &&Row| row.outcome.starts_with("not driven");
+    let undriven = view
+        .at(motion, "ours", None, &[])
+        .filter(|g| g.rows.iter().all(missing));
+    let undriven: Vec<_> = undriven
+        .filter_map(|g| Some(format!("{:.0}", rate_bit_s(g)? * 1e-3)))
+        .collect();
+    let undriven = match undriven.join(", ") {
+        none if none.is_empty() => none,
+        rates => {
+            format!(
+                " At {rates} kbit/s Telemime drives nothing: its connection does not come about."
+            )
+        }
+    };
     Some(Chart {
         name: if motion == "on-model" {
             "rate-on-model"
@@ -149,7 +165,7 @@ fn by_rate(view: &View<'_>, (motion, words): (&str, &str)) -> Option<Chart> {
             "rate-off-model"
         },
         caption: format!(
-            "The same over the rate of the bottleneck, {words}; both axes double. Where a method's packets do not fit, they queue, and the tip falls behind without end."
+            "The same over the rate of the bottleneck, {words}; both axes double. Where a method's packets do not fit, they queue, and the tip falls behind without end.{undriven}"
         ),
         panel,
     })
@@ -200,8 +216,13 @@ fn rate_distortion(view: &View<'_>) -> Option<Chart> {
             let rmse = g.figure("rmse_m")?.mean * 1e3;
             (up > 0.0 && rmse > 0.0).then_some((up, rmse))
         };
-        let groups = view.at("on-model", method, delay, &free);
-        let fits = groups.filter(|g| rate_bit_s(g).is_none());
+        let family = |g: &&Group<'_>| {
+            let text = g.text("method");
+            text == method || method == "deadband" && text.starts_with("deadband ")
+        };
+        let groups = view.groups.iter().filter(family);
+        let fits =
+            groups.filter(|g| view.is_at(g, "on-model", delay, &free) && rate_bit_s(g).is_none());
         let mut points: Vec<_> = fits.filter_map(point).collect();
         points.sort_by(|a, b| a.0.total_cmp(&b.0));
         if points.is_empty() {
@@ -262,17 +283,18 @@ fn points_of(layer: &Layer) -> &[(f64, f64)] {
 
 fn lags(view: &View<'_>) -> Option<Chart> {
     let delay = view.shown_delay_s();
+    let link = view.shown_link()?;
     let mut layers = Vec::new();
     for method in view.methods() {
-        let rows = view
-            .at("on-model", method, delay, &[])
-            .flat_map(|g| &g.rows);
+        let rows = view.shown("on-model", method).flat_map(|g| &g.rows);
         let lags = rows.filter_map(|row| Some(row.figures.lag_s? * 1e3));
         layers.extend(cdf(method, lags.collect()));
     }
     Some(Chart {
         name: "lag",
-        caption: "How many runs lag by no more than that: the shift at which tip and hand agree best. Below zero the tip is early.".into(),
+        caption: format!(
+            "How many runs lag by no more than that, over {link}: the shift at which tip and hand agree best. Below zero the tip is early."
+        ),
         panel: panel(
             &format!("Lag, {:.0} ms one way", delay? * 1e3),
             "lag / ms",
@@ -284,10 +306,11 @@ fn lags(view: &View<'_>) -> Option<Chart> {
 
 fn ages(view: &View<'_>) -> Option<Chart> {
     let delay = view.shown_delay_s();
+    let link = view.shown_link()?;
     let mut layers = Vec::new();
     for method in view.methods() {
         let mut ages = Vec::new();
-        for group in view.at("on-model", method, delay, &[]) {
+        for group in view.shown("on-model", method) {
             let course = view.course(group).unwrap_or_default();
             ages.extend(course.iter().filter_map(|m| Some(m.3? * 1e3)));
         }
@@ -295,7 +318,9 @@ fn ages(view: &View<'_>) -> Option<Chart> {
     }
     Some(Chart {
         name: "age",
-        caption: "How old what the arm follows is, of one person's runs. Telemime speaks only when it has to, so its news is older, and yet its error smaller.".into(),
+        caption: format!(
+            "How old what the arm follows is, of one person's runs over {link}. Telemime speaks only when it has to, so its news is older, and yet its error smaller."
+        ),
         panel: panel(
             &format!("Age of information, {:.0} ms one way", delay? * 1e3),
             "age / ms",

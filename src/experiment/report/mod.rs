@@ -2,6 +2,7 @@
 
 mod charts;
 mod group;
+mod outages;
 mod page;
 mod view;
 

@@ -1,11 +1,14 @@
 //! The report as one page: nothing is fetched, light and dark, wide and narrow.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use super::charts::Chart;
 use super::group::{Group, Interval};
+use super::outages::outages;
 use super::view::{View, called, delay_s, value};
 use crate::experiment::factor::{FACTORS, UNUSED};
+use crate::experiment::real::Ground;
 use crate::experiment::store::Manifest;
 use crate::figure::FigureError;
 
@@ -45,6 +48,7 @@ pub(super) fn page(
         );
     }
     out += "</section>\n";
+    out += &outages(view);
     out += &tables(view);
     out += &notes(view);
     out += &repeat(manifest, plan);
@@ -70,7 +74,7 @@ fn seeds(view: &View<'_>) -> usize {
     all.len()
 }
 
-fn plural(n: usize, one: &str, many: &str) -> String {
+pub(super) fn plural(n: usize, one: &str, many: &str) -> String {
     format!("{n} {}", if n == 1 { one } else { many })
 }
 
@@ -80,8 +84,23 @@ fn summary(view: &View<'_>, manifest: &Manifest) -> String {
     } else {
         "recorded hands"
     };
+    let ground = match manifest.ground {
+        Ground::Virtual => {
+            "Every run is both daemons’ own sessions, predictor, servo and arm over real QUIC on a virtual clock, or a baseline through the same link and the same arm."
+        }
+        Ground::Loopback => {
+            "Telemime’s runs are both daemons as processes, in real time, with a relay that shapes what passes between their sockets; baselines and floor are computed, over the same link model and through the same arm."
+        }
+        Ground::Netns => {
+            "Telemime’s runs are both daemons as processes, in real time, in two network namespaces with the kernel’s netem between them; baselines and floor are computed, over our model of the same link and through the same arm."
+        }
+    };
+    let thinned = match manifest.thinned.as_str() {
+        "" => String::new(),
+        flags => format!(" A part of the plan: <code>{}</code>.", escape(flags)),
+    };
     format!(
-        "<p class=\"lead\">{} of {}, {driven}, {} of the link’s chances. Every run is both daemons’ own sessions, predictor, servo and arm over real QUIC on a virtual clock, or a baseline through the same link and the same arm.</p>\n",
+        "<p class=\"lead\">{} of {}, {driven}, {} of the link’s chances. {ground}{thinned}</p>\n",
         plural(manifest.runs, "run", "runs"),
         plural(people(view), "person", "people"),
         plural(seeds(view).max(1), "seed", "seeds"),
@@ -90,8 +109,7 @@ fn summary(view: &View<'_>, manifest: &Manifest) -> String {
 
 /// The few figures one looks for first.
 fn tiles(view: &View<'_>) -> String {
-    let delay = view.shown_delay_s();
-    let first = |motion, method| view.at(motion, method, delay, &[]).next();
+    let first = |motion, method| view.shown(motion, method).next();
     let Some(ours) = first("on-model", "ours").or_else(|| first("off-model", "ours")) else {
         return String::new();
     };
@@ -148,7 +166,7 @@ fn texts(i: Interval, unit: f64, decimals: usize) -> (String, Option<String>) {
 }
 
 /// The same in a table.
-fn scaled(i: Interval, unit: f64, decimals: usize) -> String {
+pub(super) fn scaled(i: Interval, unit: f64, decimals: usize) -> String {
     match texts(i, unit, decimals) {
         (mean, None) => mean,
         (mean, Some(span)) => format!("{mean} <i>{span}</i>"),
@@ -276,14 +294,31 @@ fn notes(view: &View<'_>) -> String {
     if view.groups.iter().any(|g| g.text("motion") == "off-model") {
         notes.push("Motion never demonstrated: of generated hands, a wave turned into a chop, by somebody else; of recordings, another gesture of the same person where there is one.".to_owned());
     }
-    let undriven = view.groups.iter().flat_map(|g| &g.rows);
-    let undriven = undriven
-        .filter(|r| r.outcome.starts_with("not driven"))
-        .count();
-    if undriven > 0 {
+    let mut undriven: BTreeMap<(&str, &str), usize> = BTreeMap::new();
+    let mut stopped: BTreeMap<&str, usize> = BTreeMap::new();
+    for group in &view.groups {
+        for row in &group.rows {
+            if let Some(why) = row.outcome.strip_prefix("not driven: ") {
+                *undriven.entry((group.text("up"), why)).or_default() += 1;
+            }
+            if row.outcome.starts_with("stopped") && group.text("outage") == "none" {
+                *stopped.entry(group.text("up")).or_default() += 1;
+            }
+        }
+    }
+    for (link, n) in stopped {
         notes.push(format!(
-            "In {} the arm never engaged; their errors are blank, not zero.",
-            plural(undriven, "run", "runs")
+            "Over <code>{}</code> Telemime’s arm stopped by itself in {}, before or while the hand moved, and stayed where it was; that is in the means.",
+            escape(link),
+            plural(n, "run", "runs")
+        ));
+    }
+    for ((link, why), n) in undriven {
+        notes.push(format!(
+            "Over <code>{}</code> the arm never engaged in {}: {}. Their errors are blank, not zero.",
+            escape(link),
+            plural(n, "run", "runs"),
+            escape(why)
         ));
     }
     let items: String = notes.iter().map(|n| format!("<li>{n}</li>\n")).collect();
@@ -291,9 +326,22 @@ fn notes(view: &View<'_>) -> String {
 }
 
 fn repeat(manifest: &Manifest, plan: &str) -> String {
+    let mut flags = String::new();
+    if !manifest.thinned.is_empty() {
+        flags = format!(" {}", manifest.thinned);
+    }
+    let again = match manifest.ground {
+        Ground::Virtual => {
+            "The same plan gives the same bytes, with any number of threads or shards."
+        }
+        ground @ (Ground::Loopback | Ground::Netns) => {
+            flags += &format!(" --ground {ground}");
+            "In real time no two runs are quite the same: what the scheduler does is in the last digits. The plan, the link’s chances and all that is computed are."
+        }
+    };
     let mut out = format!(
-        "<section>\n<h2>To repeat it</h2>\n<pre>telemime experiment {plan} -o DIR\ntelemime report DIR</pre>\n\
-         <p>The same plan gives the same bytes, with any number of threads or shards. Version {}, seed {}, {} on {}; SHA-256 of the plan <code>{}</code>.</p>\n",
+        "<section>\n<h2>To repeat it</h2>\n<pre>telemime experiment {plan}{flags} -o DIR\ntelemime report DIR</pre>\n\
+         <p>{again} Version {}, seed {}, {} on {}; SHA-256 of the plan <code>{}</code>.</p>\n",
         escape(&manifest.version),
         manifest.seed,
         escape(&manifest.host.os),
@@ -320,7 +368,7 @@ fn repeat(manifest: &Manifest, plan: &str) -> String {
     out
 }
 
-fn escape(text: &str) -> String {
+pub(super) fn escape(text: &str) -> String {
     text.replace('&', "&amp;")
         .replace('<', "&lt;")
         .replace('>', "&gt;")

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use nalgebra::Vector3;
+use telemime_sim::link::LinkConfig;
 
 use super::group::{Group, Others, groups, varying};
 use crate::experiment::factor::{FACTORS, UNUSED, link};
@@ -66,14 +67,43 @@ impl<'a> View<'a> {
                 all.push(name);
             }
         }
+        // Of one with several settings the usual one speaks for it.
+        if all.contains(&"deadband") {
+            all.retain(|name| !name.starts_with("deadband "));
+        }
         all.sort_by_key(|name| *name == "floor");
         all
     }
 
-    /// Delays of plain groups' links, s, ascending.
+    /// Plain groups of ours, or of everybody where there is none.
+    fn leading(&self) -> Vec<&Group<'a>> {
+        let plain = || self.groups.iter().filter(|g| self.plain(g, &[]));
+        let ours: Vec<_> = plain().filter(|g| g.text("method") == "ours").collect();
+        if ours.is_empty() {
+            plain().collect()
+        } else {
+            ours
+        }
+    }
+
+    /// Whether links differ in delay, jitter and loss only: then an error may be drawn over the delay.
+    pub(super) fn differ_by_delay(&self) -> bool {
+        let rest = |g: &Group<'_>| {
+            let link = link(g.text("up"), Path::new(".")).ok()?;
+            Some(LinkConfig {
+                delay_s: 0.0,
+                jitter_s: 0.0,
+                loss: LinkConfig::default().loss,
+                ..link
+            })
+        };
+        let all: Vec<_> = self.leading().into_iter().filter_map(rest).collect();
+        all.windows(2).all(|w| w[0] == w[1])
+    }
+
+    /// Delays of those groups' links, s, ascending.
     pub(super) fn delays(&self) -> Vec<f64> {
-        let plain = self.groups.iter().filter(|g| self.plain(g, &[]));
-        let mut all: Vec<f64> = plain.filter_map(delay_s).collect();
+        let mut all: Vec<f64> = self.leading().into_iter().filter_map(delay_s).collect();
         all.sort_by(f64::total_cmp);
         all.dedup();
         all
@@ -86,6 +116,27 @@ impl<'a> View<'a> {
         delays.min_by(|a, b| off(a).total_cmp(&off(b)))
     }
 
+    /// The link that pictures of a single one show, as it is written: the first of that delay over which ours was driven.
+    pub(super) fn shown_link(&self) -> Option<&str> {
+        let delay = self.shown_delay_s();
+        let mut ours = ["on-model", "off-model"]
+            .into_iter()
+            .flat_map(|motion| self.at(motion, "ours", delay, &[]));
+        let driven = ours.find(|g| g.figure("rmse_m").is_some());
+        driven.map(|g| g.text("up"))
+    }
+
+    /// Plain groups of this motion and method over [`View::shown_link`], or over none.
+    pub(super) fn shown<'v>(
+        &'v self,
+        motion: &'v str,
+        method: &'v str,
+    ) -> impl Iterator<Item = &'v Group<'a>> {
+        let link = self.shown_link();
+        let all = self.at(motion, method, None, &[]);
+        all.filter(move |g| g.text("up") == UNUSED || Some(g.text("up")) == link)
+    }
+
     /// Plain groups of this motion and method at that delay; the floor has none.
     pub(super) fn at<'v>(
         &'v self,
@@ -94,13 +145,21 @@ impl<'a> View<'a> {
         delay: Option<f64>,
         but: &'v [&'v str],
     ) -> impl Iterator<Item = &'v Group<'a>> {
-        let fits = move |g: &&Group<'_>| {
-            g.text("motion") == motion
-                && g.text("method") == method
-                && (delay_s(g).is_none() || delay.is_none() || delay_s(g) == delay)
-                && self.plain(g, but)
-        };
+        let fits =
+            move |g: &&Group<'_>| g.text("method") == method && self.is_at(g, motion, delay, but);
         self.groups.iter().filter(fits)
+    }
+
+    /// Whether a group is plain, of this motion, and at that delay if a link concerns it.
+    pub(super) fn is_at(
+        &self,
+        group: &Group<'_>,
+        motion: &str,
+        delay: Option<f64>,
+        but: &[&str],
+    ) -> bool {
+        let off = || delay.is_some() && delay_s(group).is_some_and(|s| Some(s) != delay);
+        group.text("motion") == motion && !off() && self.plain(group, but)
     }
 
     /// The course of a group, if it was kept.

@@ -76,7 +76,7 @@ fn every_refusal_but_a_divergence_ends_the_attempt() {
         bench.session.engage(bench.now);
         bench.drain();
         assert!(
-            matches!(&bench.control[..], [OperatorControl::Engage(e)] if e.engagement == 2),
+            matches!(&bench.control[..], [.., OperatorControl::Engage(e)] if e.engagement == 2),
             "and the next has a number of its own"
         );
     }
@@ -105,6 +105,8 @@ fn what_a_declined_request_took_is_not_counted() {
     }
     let counters = bench.session.counters();
     assert_eq!((counters.rest_samples, counters.samples), (7, 3));
+    assert!(0 < counters.rest_messages && counters.rest_messages < counters.messages);
+    assert!(0 < counters.rest_knots && counters.rest_knots <= counters.knots);
     bench.hears(&RobotControl::Engaged {
         engagement: 3,
         t_us: 0,
@@ -114,7 +116,11 @@ fn what_a_declined_request_took_is_not_counted() {
         tip_q: WireRotation::default(),
     });
     bench.hears(&refused(Refusal::NotYours));
-    assert_eq!(bench.session.counters(), counters, "that was no request");
+    // What was driven is let go, and its path told to the end; nothing of it is taken back.
+    let knots = bench.session.counters().knots;
+    let kept = Counters { knots, ..counters };
+    assert_eq!(bench.session.counters(), kept, "that was no request");
+    assert!(knots >= counters.knots);
 }
 
 #[test]
@@ -229,6 +235,14 @@ fn a_plan_is_engaged_once_stored_and_kept_going() {
         })
         .collect();
     assert_eq!(bench.datagrams, expected);
+    bench.hears(&RobotControl::Engaged {
+        engagement: 1,
+        t_us: 0,
+        hand_m: [0.0; 3],
+        tip_m: [0.0; 3],
+        hand_q: None,
+        tip_q: WireRotation::default(),
+    });
     bench.hears(&state(RobotState::Ready, Cause::PlanFinished));
     bench.forget();
     bench.idle(1000);

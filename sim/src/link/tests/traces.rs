@@ -86,6 +86,39 @@ fn mahimahi_delivers_at_its_opportunities() {
 }
 
 #[test]
+fn a_beginning_that_is_set_anew_is_where_outages_and_traces_count_from() {
+    // A second of handshake, then: it begins at 3 s.
+    let begun = |mut link: Link| {
+        link.send(500 * MS, 100);
+        link.begin_at(3000 * MS);
+        link
+    };
+    let series = "t_s,delay_ms\n0,10\n1,20\n2,30\n";
+    let mut link = begun(traced(series, "outage 1.5s..2s").unwrap());
+    // Before it, the trace's end; then from its beginning, with the outage.
+    for (t_ms, late_ms) in [
+        (2500, Some(30)),
+        (3000, Some(10)),
+        (4400, Some(20)),
+        (4500, None),
+        (4999, None),
+        (5000, Some(30)),
+        (6000, Some(10)),
+    ] {
+        let arrives = link.send(t_ms * MS, 100).arrival_ns();
+        assert_eq!(arrives, late_ms.map(|late| (t_ms + late) * MS), "{t_ms} ms");
+    }
+    let mut link = begun(traced("4\n7\n", "mahimahi").unwrap());
+    let at: Vec<_> = [2990, 3000, 3005, 3008]
+        .map(|t_ms| link.send(t_ms * MS, 1500).arrival_ns().unwrap() / MS)
+        .into();
+    // The end of a round is the beginning of the next.
+    assert_eq!(at, [2990, 3000, 3007, 3011]);
+    let mut link = begun(traced("5\n6\n7\n", "delays").unwrap());
+    assert_eq!(link.send(3000 * MS, 100), Fate::whole(3005 * MS));
+}
+
+#[test]
 fn a_saturated_schedule_carries_all_its_opportunities() {
     let schedule: String = (1..=100).map(|ms| format!("{}\n", ms * ms / 10)).collect();
     let mut link = traced(&schedule, "mahimahi limit 100000").unwrap();

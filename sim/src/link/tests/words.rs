@@ -31,6 +31,13 @@ fn netems_own_examples_are_read() {
     // Synonyms, abbreviations, defaults.
     assert_eq!(link("latency 20ms"), link("del 20msec"));
     assert_eq!(link("drop 1%"), link("loss random 1%"));
+    // tc's per cent need no sign; nor does nothing.
+    assert_eq!(link("loss 1"), link("loss 1%"));
+    let bare = link("loss gemodel 2.5 30 80 0 reorder 25 50 delay 1ms");
+    assert_eq!(
+        bare,
+        link("loss gemodel 2.5% 30% 80% 0% reorder 25% 50% delay 1ms")
+    );
     assert_eq!(link("loss gemodel 1%"), link("loss gemodel 1% 99% 100% 0%"));
     assert_eq!(link("loss state 1%"), link("loss state 1% 99% 0% 100% 0%"));
     assert_eq!(link("delay 1ms reorder 5%").gap, 1);
@@ -57,8 +64,8 @@ fn what_is_wrong_is_named() {
         ("delay 2h", "`delay 2h`: not a time"),
         ("dely 5ms", "`dely` is no word of a link: limit, delay"),
         ("delay 5ms delay 6ms", "`delay` is said twice"),
-        ("loss 1", "`loss 1`: a share needs its per cent sign"),
-        ("loss 0.01", "`loss 0.01`: a share needs its per cent sign"),
+        ("loss 0.01", "`loss 0.01`: is it a fraction, or per cent"),
+        ("loss 101", "`loss 101`: not a share"),
         ("loss 101%", "`loss 101%`: not a share"),
         (
             "loss",
