@@ -273,7 +273,7 @@ impl Daemon {
                         }
                     }
                     // What an operator says; a robot's terminal does not know them.
-                    Word::Keep | Word::Refine | Word::Save(_) => {}
+                    Word::Engage | Word::Release | Word::Keep | Word::Refine | Word::Save(_) => {}
                 },
                 _ = drain.tick() => {
                     self.drain(active.as_mut(), &notices);
