@@ -49,6 +49,7 @@ fn values() -> BTreeMap<&'static str, [&'static str; 3]> {
         ),
         ("dead_time_s", ["0.01", "0.02", "30ms"]),
         ("bandwidth_rad_s", ["41", "42", "43"]),
+        ("stiffness_nm_rad", ["100", "200", "300"]),
         ("protocol_max", ["1", "2", "1"]),
         ("record", ["\"a.csv\"", "b.csv", "c.csv"]),
         ("driver", ["\"a\"", "true", "c"]),
