@@ -11,7 +11,7 @@ import time
 
 RATE_HZ = 250
 q = [float(v) for v in sys.argv[1].split(",")]  # your arm: read the joints
-newest = {"seq": 0, "q": q, "qd": [0.0] * len(q), "opening": 1.0}
+newest = {"seq": 0, "q": q, "qd": [0.0] * len(q), "opening": 1.0}  # your gripper: how far it is open, if it can tell
 
 
 def say(line):

@@ -13,7 +13,7 @@ use telemime_sim::link::{
 
 use crate::{
     arm, codec, demo, doctor, evaluate, experiment, ingest, link, pages, paper, recognise, replay,
-    select, tap, teach,
+    select, send, tap, teach,
 };
 
 /// Teleoperation that learns the operator's skills, so that the robot moves with the hand and not a
@@ -34,7 +34,7 @@ struct Cli {
 enum Command {
     /// Both daemons as two processes over a shaped link, and what became of the delay.
     Demo(Box<demo::Args>),
-    /// Make demonstrations of raw recordings: skeletons, or tables of a hand's path.
+    /// Make demonstrations of raw recordings: skeletons, tables of a hand's path, or depth frames.
     Import(Box<ingest::Args>),
     /// Learn a skill from a folder of demonstrations and save it.
     Learn(teach::LearnArgs),
@@ -58,6 +58,8 @@ enum Command {
     Robot(telemime_robot::cli::Args),
     /// Run a robot's black box again, and tell what happened.
     Replay(replay::Args),
+    /// Send a recording at true speed, as a tracker would.
+    Send(send::Args),
     Arm(arm::Args),
     Identity(admin::IdentityArgs),
     Pair(telemime_operator::cli::PairArgs),
@@ -212,6 +214,7 @@ pub fn main() -> ExitCode {
         Some(Command::Operator(args)) => telemime_operator::cli::run(args),
         Some(Command::Robot(args)) => telemime_robot::cli::run(args),
         Some(Command::Replay(args)) => replay::run(args),
+        Some(Command::Send(args)) => send::run(args),
         Some(Command::Arm(args)) => arm::run(args),
         Some(Command::Identity(args)) => admin::identity(args, Role::Operator),
         Some(Command::Pair(args)) => telemime_operator::cli::pair(args),

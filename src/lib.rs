@@ -28,6 +28,7 @@ mod recognise;
 pub mod relay;
 mod replay;
 mod select;
+mod send;
 mod tap;
 mod teach;
 mod ticks;

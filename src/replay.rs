@@ -147,7 +147,7 @@ fn line(out: &mut impl std::io::Write, row: &Row, dof: usize) -> std::io::Result
     )?;
     let places = r.tip_m.iter().chain(&r.target_m).chain(&r.reference_m);
     places
-        .chain(&[r.opening])
+        .chain(&[r.opening.unwrap_or(f64::NAN)])
         .try_for_each(|v| write!(out, ",{v}"))?;
     let set = &row.setpoint.reference;
     for joints in [

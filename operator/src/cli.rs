@@ -2,6 +2,7 @@
 
 mod args;
 mod infer;
+mod input;
 mod known;
 mod pair;
 mod played;
@@ -28,12 +29,14 @@ use tokio::sync::{mpsc, watch};
 use crate::console::{self, Known, Live};
 use crate::daemon::{Daemon, Learning, Reopen, Snapshot};
 use crate::demonstration::{Demonstration, Sample};
+use crate::input::read::Clock;
 use crate::placed::Motion;
 use crate::recording::Scribe;
 use crate::session::Leeway;
 use crate::task::{Outcome, Recording, Task};
 pub use args::{Args, Axes};
 pub use infer::{Bounds, infer};
+pub use input::InputArgs;
 use known::Known as KnownRobot;
 pub use pair::{PairArgs, pair};
 use played::Played;
@@ -104,7 +107,17 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     let trust = Trust::new([]);
     source.read(&trust)?;
     let skills = Skills::gather(&args, &log)?;
-    let (task, played) = make_task(&args, &skills, config.rotation, &log)?;
+    let clock = HostClock::new();
+    // A second before now, so that a sensor's latency may be subtracted from the first sample.
+    let epoch = Mono(clock.now().0 - 1_000_000_000);
+    let (task, played) = match &args.input.input {
+        Some(source) => (
+            args.input
+                .task(source, Clock { host: clock, epoch }, &log)?,
+            None,
+        ),
+        None => make_task(&args, &skills, config.rotation, &log)?,
+    };
     let scribe = args.record.as_deref().map(|path| {
         let say = {
             let log = log.clone();
@@ -125,7 +138,6 @@ async fn operate(args: Args) -> anyhow::Result<()> {
             quic::client(&identity, &trust, socket, &meter)
         })
     };
-    let clock = HostClock::new();
     let shown = args
         .metrics
         .map(|addr| serve_metrics(addr, &log))
@@ -138,8 +150,7 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         meter,
         robot,
         clock,
-        // A second before now, so that a sensor's latency may be subtracted from the first sample.
-        epoch: Mono(clock.now().0 - 1_000_000_000),
+        epoch,
         external: args.clock_dispersion.map(External::host),
         skill: skills.mirror(),
         recogniser: skills.recogniser(&log),
@@ -156,7 +167,6 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         ),
     };
     let (notices, heard) = mpsc::unbounded_channel();
-    let epoch = daemon.epoch;
     let progress = std::io::stderr().is_terminal() && !args.json;
     let listener = tokio::spawn(report::listen_to(
         heard,
@@ -269,7 +279,9 @@ fn make_task(
         }
         _ => match args.console {
             Some(addr) => Ok((Task::live(person(args, addr, skills, log)?), None)),
-            None => bail!("what to do? Give --replay FILE, --play SKILL or --console"),
+            None => {
+                bail!("what to do? Give --input SOURCE, --replay FILE, --play SKILL or --console")
+            }
         },
     }
 }

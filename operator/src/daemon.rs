@@ -26,8 +26,9 @@ use telemime_protocol::wire::{DecodeError, Version};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{sleep_until, timeout};
 
-use crate::console::{Act, Said, Shape};
+use crate::console::{Act, Shape};
 use crate::dial::{DialError, Dialler, Link, Seen};
+use crate::input::Driver;
 use crate::lessons::{Lesson, LessonError, Lessons};
 use crate::recognise::Recogniser;
 use crate::session::{Counters, Event, Output, Seen as LinkSeen, Session, SessionConfig};
@@ -240,12 +241,15 @@ impl Console<'_> {
         loop {
             tokio::select! {
                 biased;
-                (page, said) = hear(task) => match task.person().and_then(|live| live.handle(now(), page, said, None)) {
-                    Some(Act::Stop) => *stop = true,
-                    Some(Act::Shape(shape)) => drop(self.notices.send(Notice::LinkAsked(shape))),
-                    // Refused without a session.
-                    Some(Act::Learn { .. } | Act::Use(_)) | None => {}
-                },
+                heard = task.hear() => {
+                    match task.handle(now(), heard, None) {
+                        Some(Act::Stop) => *stop = true,
+                        Some(Act::Shape(shape)) => drop(self.notices.send(Notice::LinkAsked(shape))),
+                        // Refused without a session.
+                        Some(Act::Learn { .. } | Act::Use(_)) | None => {}
+                    }
+                    self.tell(task);
+                }
                 Some(word) = self.words.recv() => self.note(match word {
                     Word::Stop => {
                         *stop = true;
@@ -253,7 +257,7 @@ impl Console<'_> {
                     }
                     Word::Reset => "there is no link: the reset is discarded",
                     Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => NOT_HERE,
-                    Word::Keep | Word::Refine | Word::Save(_) => {
+                    Word::Engage | Word::Release | Word::Keep | Word::Refine | Word::Save(_) => {
                         "there is no link: say it again when it is back"
                     }
                 }),
@@ -262,16 +266,15 @@ impl Console<'_> {
         }
     }
 
+    /// What the input has to tell.
+    fn tell(&self, task: &mut Task) {
+        while let Some(note) = task.driver().and_then(Driver::poll_note) {
+            self.note(note);
+        }
+    }
+
     fn note(&self, text: impl Into<Cow<'static, str>>) {
         let _ = self.notices.send(Notice::Note(text.into()));
-    }
-}
-
-/// What a page says next; never ends without one.
-async fn hear(task: &mut Task) -> (u64, Said) {
-    match task.person() {
-        Some(live) => live.hear().await,
-        None => std::future::pending().await,
     }
 }
 
@@ -504,6 +507,7 @@ impl Daemon {
                 live.sent(self.meter.counts().sent.bytes);
             }
             let advice = task.advise(now, session);
+            console.tell(task);
             if advice == Advice::Performed {
                 marks.performances += 1;
                 let zero = task.zero().unwrap_or(now);
@@ -558,6 +562,10 @@ impl Daemon {
                     Word::Reset if session.reset() => {}
                     Word::Reset => console.note("the reset is discarded: the robot has not confirmed the stop yet"),
                     Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => console.note(NOT_HERE),
+                    word @ (Word::Engage | Word::Release) => match task.driver() {
+                        Some(driver) => driver.word(self.now(), word == Word::Engage, Some(session)),
+                        None => console.note("engage and release are for --input: this task has a clutch of its own"),
+                    },
                     word @ (Word::Keep | Word::Refine | Word::Save(_)) => {
                         let said = self.lesson(&word, session, lessons, notices);
                         if let Err(e) = said {
@@ -565,9 +573,8 @@ impl Daemon {
                         }
                     }
                 },
-                (page, said) = hear(task) => {
-                    let now = self.now();
-                    let act = task.person().and_then(|live| live.handle(now, page, said, Some(session)));
+                heard = task.hear() => {
+                    let act = task.handle(self.now(), heard, Some(session));
                     if let Some(act) = act {
                         self.act(act, session, task, lessons, notices);
                     }
@@ -660,7 +667,8 @@ impl Daemon {
                 lessons.save(file)?;
                 let _ = notices.send(Notice::Saved(file.clone()));
             }
-            Word::Stop | Word::Reset | Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => {}
+            Word::Stop | Word::Reset | Word::Engage | Word::Release => {}
+            Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => {}
         }
         Ok(())
     }

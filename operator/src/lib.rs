@@ -2,11 +2,15 @@
 //! only when the robot's own prediction would go wrong.
 
 pub mod cli;
+mod clutch;
 pub mod console;
 pub mod daemon;
+mod dating;
 pub mod demonstration;
+pub mod depth;
 pub mod dial;
 pub mod ingest;
+pub mod input;
 pub mod learn;
 pub mod lessons;
 pub mod placed;

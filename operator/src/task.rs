@@ -6,8 +6,9 @@ use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, Refusal, RobotState};
 
-use crate::console::Live;
+use crate::console::{Act, Live, Said};
 use crate::demonstration::Sample;
+use crate::input::{self, Driver};
 use crate::recording::Scribe;
 use crate::session::{Event, HandSample, LOST_S, Leeway, Session};
 
@@ -62,6 +63,17 @@ enum Work {
     },
     /// A person at the console page: no end of its own.
     Live(Box<Live>),
+    /// A tracked hand.
+    Input(Box<Driver>),
+}
+
+/// What a task waits for.
+#[derive(Debug)]
+pub enum Heard {
+    /// A page, by its number, says this.
+    Page(u64, Said),
+    /// The input says this.
+    Input(input::Arrived),
 }
 
 /// A hand beside a motion that is played.
@@ -161,7 +173,57 @@ impl Task {
     pub fn person(&mut self) -> Option<&mut Live> {
         match &mut self.work {
             Work::Live(live) => Some(live),
-            Work::Replay { .. } | Work::Play { .. } => None,
+            Work::Replay { .. } | Work::Play { .. } | Work::Input(_) => None,
+        }
+    }
+
+    /// Follows a tracked hand, until it is told to quit.
+    pub fn input(driver: Driver) -> Self {
+        Self::new(Work::Input(Box::new(driver)))
+    }
+
+    /// The tracked hand, if that is the task.
+    pub fn driver(&mut self) -> Option<&mut Driver> {
+        match &mut self.work {
+            Work::Input(driver) => Some(driver),
+            Work::Replay { .. } | Work::Play { .. } | Work::Live(_) => None,
+        }
+    }
+
+    /// What became of the input's frames, if there is one.
+    pub fn tally(&self) -> Option<&input::Tally> {
+        match &self.work {
+            Work::Input(driver) => Some(driver.tally()),
+            Work::Replay { .. } | Work::Play { .. } | Work::Live(_) => None,
+        }
+    }
+
+    /// What a page or the input says next; never ends without one.
+    pub async fn hear(&mut self) -> Heard {
+        match &mut self.work {
+            Work::Live(live) => {
+                let (page, said) = live.hear().await;
+                Heard::Page(page, said)
+            }
+            Work::Input(driver) => Heard::Input(driver.hear().await),
+            Work::Replay { .. } | Work::Play { .. } => std::future::pending().await,
+        }
+    }
+
+    /// Takes what was heard, and returns what only the daemon can do of it.
+    pub fn handle(
+        &mut self,
+        now: Stamp,
+        heard: Heard,
+        session: Option<&mut Session>,
+    ) -> Option<Act> {
+        match (&mut self.work, heard) {
+            (Work::Live(live), Heard::Page(page, said)) => live.handle(now, page, said, session),
+            (Work::Input(driver), Heard::Input(arrived)) => {
+                driver.handle(now, arrived, session);
+                None
+            }
+            _ => None,
         }
     }
 
@@ -186,7 +248,7 @@ impl Task {
                 self.started.map(|t| t.offset_by_secs(recording.rest_s))
             }
             Work::Play { .. } => self.engaged_at,
-            Work::Live(_) => None,
+            Work::Live(_) | Work::Input(_) => None,
         }
     }
 
@@ -195,7 +257,7 @@ impl Task {
         match &self.work {
             Work::Replay { recording, next } => *next as f64 / self.count(recording) as f64,
             Work::Play { .. } => f64::from(u8::from(self.phase == Phase::Over)),
-            Work::Live(_) => 0.0,
+            Work::Live(_) | Work::Input(_) => 0.0,
         }
     }
 
@@ -211,6 +273,7 @@ impl Task {
                     }
                     Work::Play { .. } => self.trouble.is_some(),
                     Work::Live(_) => false,
+                    Work::Input(driver) => driver.is_over(now),
                 }
     }
 
@@ -222,7 +285,9 @@ impl Task {
     /// How it ended; `quit` says that it was cut short from outside.
     pub fn outcome(&self, quit: bool) -> Outcome {
         match &self.trouble {
-            None if quit && matches!(self.work, Work::Live(_)) => Outcome::Completed,
+            None if quit && matches!(self.work, Work::Live(_) | Work::Input(_)) => {
+                Outcome::Completed
+            }
             Some(why) => Outcome::Interrupted(why.clone()),
             None if quit => Outcome::Interrupted("stopped by hand".into()),
             None if self.phase == Phase::Over => Outcome::Completed,
@@ -237,6 +302,9 @@ impl Task {
         }
         if let Some(live) = self.person() {
             return live.on_lost(why);
+        }
+        if let Some(driver) = self.driver() {
+            return driver.on_lost();
         }
         match self.phase {
             Phase::Asked | Phase::Engaged => self.give_up(format!(
@@ -255,6 +323,9 @@ impl Task {
         }
         if let Some(live) = self.person() {
             return live.on_event(now, event);
+        }
+        if let Some(driver) = self.driver() {
+            return driver.on_event(now, event);
         }
         match event {
             Event::Engaged { t_us, .. } => {
@@ -297,6 +368,13 @@ impl Task {
             live.advise(now, session);
             return Advice::Continue;
         }
+        if let Some(driver) = self.driver() {
+            if driver.advise(now, session) {
+                self.phase = Phase::Over;
+                return Advice::Finished;
+            }
+            return Advice::Continue;
+        }
         match self.phase {
             Phase::Over => return Advice::Finished,
             Phase::Between => return Advice::Between,
@@ -318,7 +396,7 @@ impl Task {
         let may_ask = self.trouble.is_none()
             && matches!(self.phase, Phase::Waiting(at) if at.is_none_or(|at| now >= at));
         match &mut self.work {
-            Work::Live(_) => {}
+            Work::Live(_) | Work::Input(_) => {}
             Work::Play { plan, beside } if may_ask => {
                 session.play(plan, beside.as_ref().map(|beside| &beside.leeway));
                 self.asked();
@@ -388,6 +466,9 @@ impl Task {
     pub fn poll_timeout(&self) -> Option<Stamp> {
         if let Work::Live(live) = &self.work {
             return live.poll_timeout();
+        }
+        if let Work::Input(driver) = &self.work {
+            return driver.poll_timeout();
         }
         if matches!(self.phase, Phase::Between | Phase::Over) {
             return None;
@@ -473,4 +554,4 @@ fn sample_at(recording: &Recording, i: usize, started: Stamp) -> Option<HandSamp
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

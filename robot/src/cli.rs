@@ -25,10 +25,11 @@ use telemime_sim::link::parse_duration_s;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
-use crate::blackbox::{Header, Keeper, Recorder, SPAN_S, Saved, taps};
+use crate::blackbox::{Header, Keeper, Recorder, SPAN_S, taps};
 use crate::clock::Origin;
 use crate::daemon::{Attendant, Daemon, Failure, Notice};
 use crate::desk::Desk;
+use crate::driver::FASTEST_HZ;
 use crate::driver::bridge::{Bridge, Words};
 use crate::refused::Refused;
 use crate::rig::Rig;
@@ -106,24 +107,28 @@ pub struct Args {
     /// Bandwidth of the filter between prediction and arm, rad/s: less is smoother, and farther behind [default: 40].
     #[arg(long, value_name = "RAD_S")]
     pub bandwidth: Option<f64>,
+    /// Joint impedance instead of computed torque: the strongest joint is a spring of this stiffness, N·m/rad, the others in
+    /// proportion to their effort limits; what the arm runs into is pushed softly.
+    #[arg(long, value_name = "NM_RAD")]
+    pub stiffness: Option<f64>,
     /// Speak protocol versions up to this one; 2 is an experiment [default: 1].
     #[arg(long, value_name = "N")]
     pub protocol_max: Option<u16>,
     /// Record into this new file: NAME.mcap, a recording that Foxglove, Lichtblick and rerun open; any other name, every
-    /// tick as CSV.
+    /// tick as CSV (into NAME-2 where NAME is there already).
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
     /// Drive a real arm: this command (run by sh) tells its joints' state and takes setpoints, a JSON line each; docs/driver.md.
     #[arg(long, value_name = "COMMAND", conflicts_with = "start")]
     pub driver: Option<String>,
-    /// The driver may be silent, or behind its setpoints, for this long before the arm is stopped [default: 100ms].
+    /// The driver may be silent, or behind its setpoints, for this long before the arm is stopped: 10ms to 2s, and three of its periods [default: 100ms].
     #[arg(long, value_name = "TIME", value_parser = parse_duration_s)]
     pub driver_patience: Option<f64>,
     /// Run the servo at this real-time priority, 1 to 99 [50 if nothing is said], and lock memory, where the system allows it.
     #[arg(long, value_name = "PRIO", num_args = 0..=1, default_missing_value = "50")]
     pub realtime: Option<u8>,
-    /// Keep the last two minutes of all that the servo is told and decides, and write them to this folder at every stop or
-    /// fault, on `blackbox` or on SIGUSR2; `telemime replay` reads them.
+    /// Keep the last two minutes of all that the servo is told and decides, and write them to this folder at stops and
+    /// faults, on `blackbox` or on SIGUSR2; `telemime replay` reads them.
     #[arg(long, value_name = "DIR")]
     pub black_box: Option<PathBuf>,
     /// Serve metrics for Prometheus at http://ADDR/metrics [127.0.0.1:9433 if no address is given].
@@ -218,7 +223,10 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     };
     let mut desk = Desk::new(own, trust.clone(), Some(source.path.clone())).expecting(expected);
     let mut bridge = args.driver.as_deref().map(Bridge::start).transpose()?;
-    let patience_s = args.patience_s()?;
+    let rate_hz = bridge
+        .as_ref()
+        .map_or(FASTEST_HZ, |bridge| bridge.hello.rate_hz);
+    let driving = args.driving(rate_hz)?;
     let priority = args.realtime.map(Priority::new).transpose()?;
     let mut options = args.rig_options()?;
     if let Some(bridge) = &bridge {
@@ -261,7 +269,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     let (rings, handle) = servo::rings();
     let mut station = match &mut bridge {
         Some(bridge) => {
-            let arm = bridge.arm(rig.arm.clone(), patience_s)?;
+            let arm = bridge.arm(rig.arm.clone(), driving)?;
             rig.servo_before(Box::new(arm), bridge.state.opening, rings)
         }
         None => rig.servo(rings),
@@ -282,7 +290,7 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
             station = station.recorded(tap);
             let recorder = Recorder::new(Header::new(&rig, args.driver.clone()), feed, SPAN_S);
             let log = log.clone();
-            let say = move |due, saved: Saved| log.black_box(due, &saved);
+            let say = move |news| log.black_box(&news);
             Some(Keeper::start(recorder, &dir, say).context("no thread for the black box")?)
         }
         None => None,

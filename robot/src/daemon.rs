@@ -254,7 +254,12 @@ impl Daemon {
                 () = told(&mut quit) => break,
                 Some(word) = words.recv() => match word {
                     Word::Stop => self.servo.brake.stop_here(),
-                    Word::Reset => self.order(Order::Reset { operator: active.is_some(), stop: None }),
+                    Word::Reset => {
+                        let reset = Order::Reset { operator: active.is_some(), stop: None };
+                        if self.order(reset).is_some() {
+                            logs::note("the servo was too busy to hear of the reset: type it again");
+                        }
+                    }
                     Word::BlackBox => match &self.asker {
                         Some(asker) => asker.ask(),
                         None => logs::note("there is no black box: start the robot with --black-box DIR"),
@@ -268,7 +273,7 @@ impl Daemon {
                         }
                     }
                     // What an operator says; a robot's terminal does not know them.
-                    Word::Keep | Word::Refine | Word::Save(_) => {}
+                    Word::Engage | Word::Release | Word::Keep | Word::Refine | Word::Save(_) => {}
                 },
                 _ = drain.tick() => {
                     self.drain(active.as_mut(), &notices);
@@ -435,11 +440,12 @@ impl Daemon {
         None
     }
 
-    fn order(&mut self, order: Order) {
+    /// Hands an order on; it comes back if there is no place for it.
+    fn order(&mut self, order: Order) -> Option<Order> {
         // 64 orders are more than a second's worth. What does not fit is not forgotten but a reason to stop.
-        if self.servo.orders.push(order).is_err() {
-            self.servo.brake.pull(Cause::Fault);
-        }
+        let rtrb::PushError::Full(order) = self.servo.orders.push(order).err()?;
+        self.servo.brake.pull(Cause::Fault);
+        Some(order)
     }
 
     /// Takes the servo's reports; says whether the newest is of an arm stopped and at rest.
@@ -491,7 +497,11 @@ impl Daemon {
                 Output::Brake(cause) => self.servo.brake.pull(cause),
                 // Too large or unsupported cannot happen (1100 B); a lost connection shows up in `receive`.
                 Output::Datagram(bytes) => drop(active.connection.send_datagram(bytes.into())),
-                Output::Order(order) => self.order(order),
+                Output::Order(order) => {
+                    if let Some(order) = self.order(order) {
+                        active.session.handle_lost(&order);
+                    }
+                }
                 Output::Goodbye => return Some((CLOSED, "the operator said goodbye".into())),
             }
         }
@@ -511,7 +521,8 @@ impl Daemon {
         ended.session.handle_closed();
         while let Some(output) = ended.session.poll_output() {
             if let Output::Order(order) = output {
-                self.order(order);
+                // The brake has been pulled for one that is lost, and there is nobody to tell.
+                let _ = self.order(order);
             }
         }
         let Active {

@@ -264,8 +264,8 @@ impl Rig {
         self.config.lag_s
     }
 
-    /// A core at rest at the start posture; what it no longer needs goes into `spent`.
-    pub fn core(&self, opening: f64, spent: rtrb::Producer<Arc<Trajectory>>) -> Core {
+    /// A core at rest at the start posture, the gripper open as far as `opening` if that is known; what it no longer needs goes into `spent`.
+    pub fn core(&self, opening: Option<f64>, spent: rtrb::Producer<Arc<Trajectory>>) -> Core {
         Core::new(self.config, self.controller.clone(), opening, spent)
     }
 
@@ -274,11 +274,16 @@ impl Rig {
         let gripper = Gripper::default();
         let opening = gripper.opening();
         let arm = SimulatedArm::new(self.plant.clone(), gripper);
-        self.servo_before(Box::new(arm), opening, rings)
+        self.servo_before(Box::new(arm), Some(opening), rings)
     }
 
-    /// A servo at rest before `arm`, which is in the start posture and whose gripper is open as far as `opening`.
-    pub fn servo_before(&self, arm: Box<dyn Manipulator>, opening: f64, rings: Rings) -> Station {
+    /// A servo at rest before `arm`, which is in the start posture and whose gripper is open as far as `opening`, if that is known.
+    pub fn servo_before(
+        &self,
+        arm: Box<dyn Manipulator>,
+        opening: Option<f64>,
+        rings: Rings,
+    ) -> Station {
         let Rings {
             orders,
             reports,

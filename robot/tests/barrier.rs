@@ -8,8 +8,8 @@ use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_robot::control::{
-    BarrierConfig, ClampCounts, ControlConfig, ControlError, Controller, Demand, Plane,
-    home_posture,
+    BarrierConfig, CartesianLimits, ClampCounts, ControlConfig, ControlError, Controller, Demand,
+    Output, Plane, home_posture, joint_accelerations,
 };
 use telemime_sim::arm::{ArmModel, Joints, Kinematics, LoadOptions, Plant, default_urdf};
 
@@ -92,6 +92,57 @@ struct Least {
     tip_m: f64,
     joints_beyond: f64,
     counts: ClampCounts,
+    limits: Limits,
+}
+
+/// The most of its limits that the reference took, as shares of them.
+#[derive(Debug, Default, Clone, Copy)]
+struct Limits {
+    /// The joints' speed, by what it is said to be and by the way of a tick; and their acceleration.
+    joint_speed: f64,
+    joint_acceleration: f64,
+    /// The tip filter's output, by what it is said to be and by the way of a tick.
+    speed: f64,
+    acceleration: f64,
+    jerk: f64,
+    /// The same where the arm could not follow and the filter was set back to what it does: its speed, and the change of it in a tick by the limit.
+    held_speed: f64,
+    held_change: f64,
+    held: usize,
+}
+
+impl Limits {
+    fn see(
+        &mut self,
+        arm: &ArmModel,
+        limits: &CartesianLimits,
+        brake: &Joints,
+        last: &Output,
+        out: &Output,
+    ) {
+        for (i, joint) in arm.joints().iter().enumerate() {
+            let (before, after) = (&last.setpoint, &out.setpoint);
+            let way = (after.q[i] - before.q[i]).abs() / DT_S;
+            let speed = after.qd[i].abs().max(way) / joint.velocity;
+            let change = (after.qd[i] - before.qd[i]).abs() / DT_S;
+            self.joint_speed = self.joint_speed.max(speed);
+            self.joint_acceleration = self.joint_acceleration.max(change / brake[i]);
+        }
+        let (before, after) = (&last.reference, &out.reference);
+        let way = (after.p - before.p).norm() / DT_S;
+        let change = (after.v - before.v).norm() / DT_S;
+        let jerk = (after.a - before.a).norm() / DT_S;
+        self.acceleration = self.acceleration.max(after.a.norm() / limits.a_max);
+        if last.clamps.held_back {
+            self.held_speed = self.held_speed.max(after.v.norm() / limits.v_max);
+            self.held_change = self.held_change.max(change / limits.a_max);
+            self.held += 1;
+            return;
+        }
+        self.speed = self.speed.max(after.v.norm().max(way) / limits.v_max);
+        self.acceleration = self.acceleration.max(change / limits.a_max);
+        self.jerk = self.jerk.max(jerk / limits.j_max);
+    }
 }
 
 fn planes() -> Vec<Plane> {
@@ -121,11 +172,20 @@ fn attack(seed: u64, minutes: f64, barrier: BarrierConfig, simulated: bool) -> L
         tip_m: f64::INFINITY,
         joints_beyond: f64::NEG_INFINITY,
         counts: ClampCounts::default(),
+        limits: Limits::default(),
     };
+    let (limits, brake) = (
+        *controller.limits(),
+        joint_accelerations(&arm, &home).unwrap(),
+    );
+    let mut last: Option<Output> = None;
     let (mut q, mut qd) = (home, Joints::zeros());
     for _ in 0..(minutes * 60.0 / DT_S) as usize {
         let demand = adversary.demand(&kinematics, arm.dof());
         let out = controller.tick(demand, &q, &qd);
+        if let Some(last) = last.replace(out) {
+            least.limits.see(&arm, &limits, &brake, &last, &out);
+        }
         if simulated {
             plant.step(&out.tau, DT_S);
             (q, qd) = (*plant.q(), *plant.qd());
@@ -147,10 +207,11 @@ fn attack(seed: u64, minutes: f64, barrier: BarrierConfig, simulated: bool) -> L
     }
     least.counts = *controller.counts();
     println!(
-        "seed {seed}: hulls {:.2} mm apart, tip {:.2} mm inside the planes; {:?}",
+        "seed {seed}: hulls {:.2} mm apart, tip {:.2} mm inside the planes; {:?}; {:?}",
         least.between_m * 1e3,
         least.tip_m * 1e3,
-        least.counts
+        least.counts,
+        least.limits
     );
     least
 }
@@ -171,7 +232,18 @@ fn adversarial_targets_never_bring_links_together_nor_the_tip_through_a_plane() 
         assert!(least.between_m >= stop_m, "{} m", least.between_m);
         assert!(least.tip_m >= 0.0, "{} m", least.tip_m);
         assert!(least.joints_beyond <= 0.0, "{}", least.joints_beyond);
+        // To rounding, on every tick, whatever the barrier does.
+        let most = least.limits;
+        for share in [most.joint_speed, most.joint_acceleration] {
+            assert!(share <= 1.0 + 1e-9, "{most:?}");
+        }
+        for share in [most.speed, most.acceleration, most.jerk, most.held_speed] {
+            assert!(share <= 1.0 + 1e-9, "{most:?}");
+        }
+        // What the filter is set back to is what the joints do, and that is within their limits, not the tip's: measured up to 22.4 times the tip's acceleration.
+        assert!(most.held_change <= 30.0, "{most:?}");
         // It was tried.
+        assert!(most.held > 10_000 && most.speed > 0.9 && most.joint_speed > 0.9);
         assert!(least.counts.near_itself > 0 && least.counts.near_plane > 0);
     }
 }

@@ -89,7 +89,7 @@ impl Bench {
         let (setpoints, hears) = rtrb::RingBuffer::new(64);
         let state = ArmState {
             q: rig.home,
-            opening: 1.0,
+            opening: Some(1.0),
             ..ArmState::default()
         };
         let config = DriverConfig {
@@ -99,7 +99,7 @@ impl Bench {
         let arm = DriverArm::new(rig.arm.clone(), config, state, heard, setpoints);
         let (rings, handle) = rings();
         Self {
-            core: rig.servo_before(Box::new(arm), 1.0, rings),
+            core: rig.servo_before(Box::new(arm), Some(1.0), rings),
             handle,
             driver: Some(Perfect { says, hears }),
             ..Self::new()

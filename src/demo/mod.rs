@@ -10,7 +10,7 @@ mod processes;
 mod summary;
 
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, bail};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
@@ -108,7 +108,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     if let Some(addr) = args.console {
         return page::run(args, addr, scratch.path());
     }
-    let mut material = material(args, scratch.path())?;
+    let mut material = material(args)?;
     if args.correct {
         material.correction = Some(correct::hand(args, &material)?);
     }
@@ -127,12 +127,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     }
 }
 
-fn material(args: &Args, scratch: &Path) -> anyhow::Result<Material> {
+fn material(args: &Args) -> anyhow::Result<Material> {
     let Some(demos) = args.demos.clone() else {
         if args.replay.is_some() {
             bail!("--replay needs --demos: which recordings is the skill learned from?");
         }
-        return generated(args, scratch);
+        return generated(args);
     };
     let found = Demonstrations::read_dir(&demos, args.matching.as_deref())?;
     let (replay, recording) = match &args.replay {
@@ -163,10 +163,12 @@ fn material(args: &Args, scratch: &Path) -> anyhow::Result<Material> {
 }
 
 /// A synthetic person waving, or carrying something if that is to be corrected: performances 0 to 4 to learn from, 5 to drive.
-fn generated(args: &Args, scratch: &Path) -> anyhow::Result<Material> {
-    let demos = scratch.join(if args.correct { "carry" } else { "swing" });
-    std::fs::create_dir(&demos)?;
-    let replay = scratch.join("unseen.csv");
+/// They are left beside the figures, as examples of what a recording is.
+fn generated(args: &Args) -> anyhow::Result<Material> {
+    let recordings = args.out.join("recordings");
+    let demos = recordings.join(if args.correct { "carry" } else { "swing" });
+    std::fs::create_dir_all(&demos).with_context(|| format!("cannot make {}", demos.display()))?;
+    let replay = recordings.join("unseen.csv");
     for index in 0..=PERFORMANCES {
         let samples: Vec<_> = if args.correct {
             correct::demonstration(args.seed, index)

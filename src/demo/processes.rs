@@ -50,6 +50,15 @@ pub(super) async fn start_robot(
         "--peer".to_owned(),
         operator_is.to_string(),
     ]);
+    if let Some(ticks) = ticks {
+        // A robot writes over nothing, and this is the file that is read.
+        match std::fs::remove_file(ticks) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                return Err(e).with_context(|| format!("cannot replace {}", ticks.display()));
+            }
+            _ => {}
+        }
+    }
     robot_args.extend(flag("--record", ticks.map(text)));
     robot_args.extend(flag("--urdf", args.urdf.as_deref().map(text)));
     robot_args.extend(flag("--tip", args.tip.as_ref()));

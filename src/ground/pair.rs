@@ -178,9 +178,9 @@ impl Robot {
                 // As often as the thread does it that a robot has for this.
                 if let Some(recorder) = recorder.as_mut().filter(|_| report.tick % 50 == 0)
                     && let Some(due) = recorder.drain()
-                    && let Some(bytes) = recorder.bytes(due)
+                    && let Some(draft) = recorder.draft(due)
                 {
-                    kept.borrow_mut().push((due, bytes));
+                    kept.borrow_mut().push((due, draft.sealed()));
                 }
             }
         });

@@ -11,14 +11,15 @@ use anyhow::{Context, bail};
 use serde_json::json;
 use telemime_endpoint::cli::one_line;
 use telemime_endpoint::recording;
+use telemime_operator::depth::Intrinsics;
 use telemime_operator::ingest::segment::Method;
 use telemime_operator::ingest::{
     Axes, Columns, Cut, Fault, Format, Imported, IngestError, LengthUnit, MAX_GAP_S, Options,
-    Report, TimeUnit, import,
+    Report, TimeUnit, grip_range, import, import_depth,
 };
 
-/// Make demonstrations of raw recordings: Kinect or OpenNI skeletons, tables of a hand's path, or what the operator daemon
-/// recorded (--record), of which every engagement is one.
+/// Make demonstrations of raw recordings: Kinect or OpenNI skeletons, tables of a hand's path, depth frames, or what the
+/// operator daemon recorded (--record), of which every engagement is one.
 ///
 /// Each RAW file is read, cleaned and written to DIR as CSV (t,x,y,z, in s and m; orientation and gripper come along),
 /// so that `telemime learn DIR` can follow at once. What was changed is counted and said. A file that cannot be
@@ -30,7 +31,7 @@ use telemime_operator::ingest::{
   telemime import monday.mcap -o screw
   telemime import mocap.tsv --columns t=Time,x=RH_X,y=RH_Y,z=RH_Z --unit mm --axes x,z,-y -o reach")]
 pub(crate) struct Args {
-    /// Raw recordings; of a folder, every .txt, .csv, .tsv and .mcap in it.
+    /// Raw recordings; of a folder, every .txt, .csv, .tsv and .mcap in it (depth: the folder is one recording).
     #[arg(value_name = "RAW", required = true)]
     raw: Vec<PathBuf>,
     /// The folder to write to, made if need be; its name becomes the skill's.
@@ -39,8 +40,8 @@ pub(crate) struct Args {
     /// Write to DIR/NAME instead.
     #[arg(long, value_name = "NAME", value_parser = folder_name)]
     skill: Option<String>,
-    /// kard (a joint a line, 15 a frame), kinect (a frame a line, 20 joints) or csv (a sample a line)
-    /// [default: by the first line].
+    /// kard (a joint a line, 15 a frame), kinect (a frame a line, 20 joints), csv (a sample a line) or depth (a folder
+    /// of 16-bit PNG, a frame each, in which the hand is looked for) [default: by the first line].
     #[arg(long, value_name = "FORMAT")]
     format: Option<Format>,
     /// The joint of a skeleton to take.
@@ -50,10 +51,10 @@ pub(crate) struct Args {
     /// [default: by these names].
     #[arg(long, value_name = "MAP")]
     columns: Option<Columns>,
-    /// Frames come evenly at this rate, whatever times the file states [default: its times; kard has none: 30].
+    /// Frames come evenly at this rate, whatever times the file states [default: its times; kard and depth have none: 30].
     #[arg(long, value_name = "HZ", value_parser = positive)]
     fps: Option<f64>,
-    /// Unit of lengths: m, cm or mm [default: kard mm, else m].
+    /// Unit of lengths: m, cm or mm [default: kard and depth mm, else m].
     #[arg(long, value_name = "UNIT")]
     unit: Option<LengthUnit>,
     /// Unit of times: s, ms, us or ns [default: by the usual step].
@@ -63,8 +64,14 @@ pub(crate) struct Args {
     #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
     axes: Option<Axes>,
     /// Readings of the gripper when it is closed and when it is open.
-    #[arg(long, value_name = "CLOSED,OPEN", default_value = "0,1", value_parser = range, allow_hyphen_values = true)]
+    #[arg(long, value_name = "CLOSED,OPEN", default_value = "0,1", value_parser = grip_range, allow_hyphen_values = true)]
     grip_range: (f64, f64),
+    /// Depth: the camera's focal lengths and principal point, pixels [default: a Kinect's, for the frames' size].
+    #[arg(long, value_name = "FX,FY,CX,CY")]
+    camera: Option<Intrinsics>,
+    /// Depth: left and right are turned around: for a camera in whose picture the person's right hand is on the left.
+    #[arg(long)]
+    mirror: bool,
     /// Smooth without shifting in time, −3 dB at this frequency [default: no smoothing].
     #[arg(long, value_name = "HZ", value_parser = positive)]
     smooth: Option<f64>,
@@ -98,14 +105,6 @@ fn positive(text: &str) -> Result<f64, String> {
         .ok_or_else(|| format!("{text:?} is not a number above 0"))
 }
 
-fn range(text: &str) -> Result<(f64, f64), String> {
-    let number = |t: &str| t.trim().parse().ok().filter(|v: &f64| v.is_finite());
-    text.split_once(',')
-        .and_then(|(closed, open)| number(closed).zip(number(open)))
-        .filter(|(closed, open)| closed != open)
-        .ok_or_else(|| format!("{text:?} is not two different numbers, as 0,0.08"))
-}
-
 fn folder_name(text: &str) -> Result<String, String> {
     let plain = !text.contains(['/', '\\']) && !text.starts_with('.');
     if plain && (1..=64).contains(&text.len()) {
@@ -125,7 +124,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     if !args.at.is_empty() && args.raw.len() != 1 {
         bail!("--at cuts one recording; import the others by themselves");
     }
-    let raws = expanded(&args.raw)?;
+    let depth = args.format == Some(Format::Depth);
+    let raws = expanded(&args.raw, depth)?;
     let options = Options {
         format: args.format,
         joint: args.joint.clone(),
@@ -135,6 +135,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         length: args.unit,
         axes: args.axes.unwrap_or_default(),
         grip_range: args.grip_range,
+        camera: args.camera,
+        mirror: args.mirror,
         max_gap_s: args.max_gap,
         keep_glitches: args.keep_glitches,
         smooth_hz: args.smooth,
@@ -150,7 +152,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     };
     let mut folder = write::Folder::open(&dir, &raws, args.force)?;
     let mut done: Vec<Done> = Vec::new();
-    for (raw, bytes) in raws.into_iter().flat_map(opened) {
+    let open = |raw| match depth {
+        true => vec![(raw, Ok(Vec::new()))],
+        false => opened(raw),
+    };
+    for (raw, bytes) in raws.into_iter().flat_map(open) {
         let result = bytes.and_then(|bytes| {
             let imported = convert(&raw, &bytes, &options)?;
             let paths = folder.write(&raw, &imported.takes)?;
@@ -191,7 +197,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 fn convert(raw: &Path, bytes: &[u8], options: &Options) -> anyhow::Result<Imported> {
-    Ok(import(bytes, options).map_err(|fault| of(raw, fault))?)
+    let imported = match options.format {
+        Some(Format::Depth) => import_depth(raw, options),
+        _ => import(bytes, options),
+    };
+    Ok(imported.map_err(|fault| of(raw, fault))?)
 }
 
 fn of(raw: &Path, fault: impl Into<Fault>) -> IngestError {
@@ -216,11 +226,11 @@ fn opened(raw: PathBuf) -> Vec<(PathBuf, anyhow::Result<Vec<u8>>)> {
     }
 }
 
-/// Files as given; folders by what is in them. No file twice.
-fn expanded(given: &[PathBuf]) -> anyhow::Result<Vec<PathBuf>> {
+/// Files as given; folders by what is in them, unless each is a recording. None twice.
+fn expanded(given: &[PathBuf], folders: bool) -> anyhow::Result<Vec<PathBuf>> {
     let mut all = Vec::new();
     for path in given {
-        if !path.is_dir() {
+        if folders || !path.is_dir() {
             all.push(path.clone());
             continue;
         }

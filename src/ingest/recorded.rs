@@ -1,6 +1,6 @@
 //! The hand of each engagement, out of a recording that the operator daemon made.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use telemime_endpoint::recording::read::{ReadError, read};
@@ -55,7 +55,8 @@ pub(super) fn engagements(
     path: &Path,
     say: impl Fn(String),
 ) -> Result<Vec<Engagement>, RecordedError> {
-    let mut hands: BTreeMap<(u32, u32), Vec<Hand>> = BTreeMap::new();
+    let mut runs: Vec<Vec<Hand>> = Vec::new();
+    let mut running = false;
     let mut granted = BTreeSet::new();
     let (mut number, mut heard, mut wrong) = (0, false, None);
     let contents = read(path, |message| {
@@ -72,13 +73,16 @@ pub(super) fn engagements(
         if message.schema == Hand::NAME {
             heard = true;
             match serde_json::from_slice::<Hand>(message.data) {
-                Ok(hand) if hand.engagement > 0 && !hand.resting => {
-                    let driven = hands.entry((hand.session, hand.engagement)).or_default();
-                    if driven.last().is_none_or(|last| last.t_ns < hand.t_ns) {
-                        driven.push(hand);
+                Ok(hand) if hand.engagement == 0 => running = false,
+                Ok(hand) if hand.resting => {}
+                Ok(hand) => {
+                    // A robot that was restarted counts from 1 again: the numbers alone do not tell engagements apart.
+                    match runs.last_mut().filter(|run| running && follows(run, &hand)) {
+                        Some(run) => run.push(hand),
+                        None => runs.push(vec![hand]),
                     }
+                    running = true;
                 }
-                Ok(_) => {}
                 Err(e) => refuse(Hand::NAME, e),
             }
         } else if message.schema == OperatorState::NAME {
@@ -101,20 +105,44 @@ pub(super) fn engagements(
             path.display()
         ));
     }
-    hands.retain(|which, driven| granted.contains(which) && driven.len() >= LEAST_SAMPLES);
-    if hands.is_empty() {
+    runs.retain(|run| granted.contains(&number_of(run)));
+    runs.retain(|run| {
+        let long = run.len() >= LEAST_SAMPLES;
+        if !long {
+            say(format!(
+                "{}: engagement {} of session {} is left out: {} samples are too few to learn from",
+                path.display(),
+                number_of(run).1,
+                number_of(run).0,
+                run.len()
+            ));
+        }
+        long
+    });
+    if runs.is_empty() {
         return Err(RecordedError::NeverDriven { path });
     }
-    let several = hands.len() > 1;
-    let named = hands.into_values().zip(1..).map(|(driven, number)| {
+    let several = runs.len() > 1;
+    let named = runs.iter().zip(1..).map(|(driven, number)| {
         let stem = path.file_stem().unwrap_or_default().to_string_lossy();
         let raw = path.with_file_name(format!("{stem}-{number}.mcap"));
         Engagement {
             raw: if several { raw } else { path.clone() },
-            table: table(&driven),
+            table: table(driven),
         }
     });
     Ok(named.collect())
+}
+
+/// Session and engagement.
+fn number_of(run: &[Hand]) -> (u32, u32) {
+    run.last()
+        .map_or((0, 0), |last| (last.session, last.engagement))
+}
+
+fn follows(run: &[Hand], hand: &Hand) -> bool {
+    number_of(run) == (hand.session, hand.engagement)
+        && run.last().is_none_or(|last| last.t_ns < hand.t_ns)
 }
 
 /// Columns that some sample lacks are left out.
@@ -135,4 +163,97 @@ fn table(driven: &[Hand]) -> String {
         text.push('\n');
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::RefCell;
+
+    use telemime_endpoint::recording::{At, Json, Recording, Tape};
+    use telemime_protocol::time::Stamp;
+
+    use super::*;
+
+    fn hand(ms: i64, session: u32, engagement: u32) -> Hand {
+        Hand {
+            t_ns: ms * 1_000_000,
+            x: [ms as f64 * 1e-3, 0.0, 0.0],
+            orientation: None,
+            grip: Some(0.25),
+            resting: ms % 1000 < 100,
+            session,
+            engagement,
+        }
+    }
+
+    fn state(session: u32, engagement: u32) -> OperatorState {
+        OperatorState {
+            robot: "Engaged".into(),
+            cause: "Requested".into(),
+            session,
+            engagement,
+            scale: None,
+            messages: 0,
+            knots: 0,
+            samples: 0,
+            glitches: 0,
+            age_s: None,
+            delay_s: None,
+            clock_bound_s: None,
+            lag_s: None,
+            clamps: None,
+            lost: None,
+            knots_held: None,
+        }
+    }
+
+    #[test]
+    fn every_engagement_that_was_granted_is_a_table_of_its_own() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("mon.day.mcap");
+        let write = |tape: &mut Tape, hand: Hand| {
+            let at = At::once(Stamp(hand.t_ns));
+            if hand.engagement != 3 {
+                let state = state(hand.session, hand.engagement);
+                tape.message("/operator/state", at, &Json(state))?;
+            }
+            tape.message("/operator/hand", at, &Json(hand))
+        };
+        let recording = Recording::start(&path, [].into(), write, |_| ()).unwrap();
+        // Not followed; followed; declined; too short; followed; and after the robot's restart the same numbers again.
+        let spans = [
+            (0, 1, 0, 20),
+            (1000, 1, 1, 40),
+            (2000, 1, 3, 40),
+            (3000, 1, 4, 12),
+            (4000, 1, 5, 30),
+            (5000, 1, 0, 5),
+            (6000, 1, 5, 25),
+        ];
+        for (from_ms, session, engagement, count) in spans {
+            for i in 0..count {
+                recording.push(hand(from_ms + 20 * i, session, engagement));
+            }
+        }
+        drop(recording);
+        let said = RefCell::new(Vec::new());
+        let all = engagements(&path, |note| said.borrow_mut().push(note)).unwrap();
+        let names: Vec<_> = all
+            .iter()
+            .map(|one| one.raw.file_name().unwrap().to_str().unwrap())
+            .collect();
+        assert_eq!(
+            names,
+            ["mon.day-1.mcap", "mon.day-2.mcap", "mon.day-3.mcap"]
+        );
+        let rows: Vec<_> = all.iter().map(|one| one.table.lines().count()).collect();
+        // Five of each span are at rest; the first line names the columns.
+        assert_eq!(rows, [36, 26, 21]);
+        let lines: Vec<_> = all[0].table.lines().collect();
+        assert_eq!(lines[..2], ["t,x,y,z,grip", "0,1.1,0,0,0.25"]);
+        assert_eq!(lines[35], "0.68,1.78,0,0,0.25");
+        let said = said.into_inner();
+        assert_eq!(said.len(), 1, "{said:?}");
+        assert!(said[0].contains("engagement 4") && said[0].contains("7 samples"));
+    }
 }

@@ -18,6 +18,9 @@ def main():
     say({"telemime_driver": 1, "joints": [f"joint{i + 1}" for i in range(len(Q))], "rate_hz": RATE_HZ})
     q, qd, seq, heard, said = Q, [0.0] * len(Q), 0, b"", 0
     due = time.monotonic()
+    if HOW == "moved":
+        say({"q": q, "qd": qd})
+        q = [q[0] + 0.1, *q[1:]]
     while True:
         say({"q": q, "qd": qd, "seq": seq})
         said += 1
@@ -37,6 +40,11 @@ def main():
             continue
         if HOW == "die":
             return
+        if HOW == "mute":
+            os.close(1)
+            time.sleep(3600)
+        if HOW == "ahead":
+            seq += 1000
         if HOW == "stall":
             time.sleep(3600)
         if HOW == "garbage":

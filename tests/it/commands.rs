@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
-const COMMANDS: [&str; 26] = [
+const COMMANDS: [&str; 27] = [
     "demo",
     "import",
     "learn",
@@ -17,6 +17,7 @@ const COMMANDS: [&str; 26] = [
     "codec",
     "robot",
     "replay",
+    "send",
     "arm check",
     "operator",
     "identity",

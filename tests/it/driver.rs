@@ -45,7 +45,7 @@ fn the_documented_driver_is_driven_and_its_record_replays() {
         "--driver",
         &driver,
         "--driver-patience",
-        "5s",
+        "2s",
         "--black-box",
         folder,
     ];
@@ -116,6 +116,9 @@ fn a_driver_that_fails_stops_the_arm_with_its_reason_and_an_exit_code() {
     let _alone = alone();
     for (how, kind, words) in [
         ("die", "Ended", "the driver has ended"),
+        // The process outlives its output, and does not read any more.
+        ("mute", "Ended", "the driver has ended"),
+        ("ahead", "Unmade", "that it obeys setpoint"),
         ("stall", "Stalled", "has not told the joints' state"),
         ("garbage", "Garbage", "is no joint state"),
         ("leap", "Leapt", "joint 0 has leapt"),
@@ -163,7 +166,7 @@ fn an_operator_hears_that_the_arm_failed() {
     // The example writes its own process's number for whoever is to end it.
     let pid = stage.text("pid");
     let driver = format!("echo $$ > {pid}; {driver}");
-    let flags = ["--driver", &driver, "--driver-patience", "5s"];
+    let flags = ["--driver", &driver, "--driver-patience", "2s"];
     let (robot, addr) = stage.robot_with(&flags);
     let operator = stage.operator(&addr, "operator");
     operator.event_where("progress", |e| e["done"].as_f64().unwrap() > 0.3);
@@ -189,6 +192,10 @@ fn a_driver_that_is_none_is_one_clear_line() {
     for (driver, words) in [
         ("exit 3", "it ended before"),
         ("echo hello", "line 1"),
+        // A banner, from one that goes on and never ends by itself.
+        ("echo connecting; exec sleep 3600", "line 1"),
+        // The same from a child of it that has its input and does not read.
+        ("echo connecting; sleep 3600 & exec sleep 3600", "line 1"),
         (
             r#"echo '{"telemime_driver":9,"joints":["a"],"rate_hz":100}'"#,
             "version 9",
@@ -208,6 +215,45 @@ fn a_driver_that_is_none_is_one_clear_line() {
         assert_eq!(status.code(), Some(1), "{driver}");
         let line = said.lines().last().unwrap_or_default();
         assert!(line.contains(words), "{driver}: {said}");
+    }
+}
+
+#[test]
+fn an_arm_that_is_moved_while_the_robot_starts_is_not_driven() {
+    let _alone = alone();
+    let Some(driver) = command("tests/driver/faulty.py", "moved") else {
+        return;
+    };
+    let stage = Stage::new();
+    let key = stage.text("robot.key");
+    let flags = ["robot", "--identity", &key, "--driver", &driver];
+    let (status, said) = Process::start(&flags).end();
+    assert_eq!(status.code(), Some(1), "{said}");
+    assert!(said.contains("joint 0 has moved by 0.1000"), "{said}");
+}
+
+#[test]
+fn a_patience_that_does_not_go_with_the_drivers_rate_is_refused() {
+    let _alone = alone();
+    let stage = Stage::new();
+    let key = stage.text("robot.key");
+    let slow = r#"echo '{"telemime_driver":1,"joints":["a"],"rate_hz":10}'; echo '{"q":[1],"qd":[0]}'; cat"#;
+    for (patience, words) in [
+        ("100ms", "three of its periods, 0.300 s"),
+        ("5s", "from 10ms to 2s"),
+    ] {
+        let flags = [
+            "robot",
+            "--identity",
+            &key,
+            "--driver",
+            slow,
+            "--driver-patience",
+            patience,
+        ];
+        let (status, said) = Process::start(&flags).end();
+        assert_eq!(status.code(), Some(1), "{said}");
+        assert!(said.contains(words), "{said}");
     }
 }
 

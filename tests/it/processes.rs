@@ -89,6 +89,16 @@ impl Process {
         writeln!(stdin, "{line}").unwrap();
     }
 
+    /// Ends its standard input.
+    pub(crate) fn closes(&mut self) {
+        drop(self.child.stdin.take());
+    }
+
+    /// The next line it prints, while there is one.
+    pub(crate) fn line(&self) -> Option<String> {
+        self.lines.recv_timeout(PATIENCE).ok()
+    }
+
     pub(crate) fn signal(&self, signal: Signal) {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
     }

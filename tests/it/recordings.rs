@@ -254,7 +254,7 @@ fn a_full_disk_ends_the_recording_and_not_the_robot() {
     let ended = robot.event("recording");
     let error = ended["error"].as_str().unwrap();
     assert!(
-        error.contains("robot.mcap") && error.contains("ends here"),
+        error.contains("robot.mcap: File too large") && error.contains("ends here"),
         "{error}"
     );
     let done = operator.event("done");
@@ -265,7 +265,9 @@ fn a_full_disk_ends_the_recording_and_not_the_robot() {
     // What was written is a whole file: its torn end was cut off.
     let (there, contents) = topics(Path::new(&of_robot));
     assert!(
-        contents.complete && there["/robot/state"].1 > 100,
+        contents.complete
+            && contents.messages == ended["messages"]
+            && there["/robot/state"].1 > 100,
         "{there:?}"
     );
 }

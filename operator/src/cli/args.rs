@@ -9,15 +9,17 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 use serde::Deserialize;
 use telemime_endpoint::{cli, logs};
 
+use super::input::InputArgs;
 use crate::console::Shape;
 use crate::placed::Placed;
 use crate::session::{FutureBound, SessionConfig};
 
 /// Teach, drive and play a robot.
 ///
-/// Replays a recording as if the hand were there (--replay), or plays a learned skill (--play). The robot must be
+/// Follows a tracked hand (--input), replays a recording as if the hand were there (--replay), or plays a learned
+/// skill (--play). The robot must be
 /// known: pair with it once (`telemime pair HOST:PORT`), or give the fingerprint it prints with --peer. On the
-/// terminal, type stop (emergency stop), reset, or quit; keep takes the performance driven last as a demonstration,
+/// terminal, type stop (emergency stop), reset, or quit; engage and release are the clutch of --input; keep takes the performance driven last as a demonstration,
 /// refine learns from those kept, and save FILE writes the skill as it is now.
 #[derive(clap::Args, Debug, Clone, Default)]
 pub struct Args {
@@ -100,6 +102,9 @@ pub struct Args {
     /// Tip metres per hand metre [default: from the demonstrations and the arm's limits].
     #[arg(long)]
     pub scale: Option<f64>,
+    /// A hand that is tracked while it drives.
+    #[command(flatten)]
+    pub input: InputArgs,
     /// The hand's axes [default: kinect].
     #[arg(long, value_enum)]
     pub axes: Option<Axes>,

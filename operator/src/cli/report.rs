@@ -15,6 +15,7 @@ use tokio::sync::mpsc;
 use super::played::Played;
 use crate::console::Shape;
 use crate::daemon::{Notice, Summary};
+use crate::input::Tally;
 use crate::learn::align::Aligned;
 use crate::recognise::Verdict;
 use crate::session::{self, Change};
@@ -231,6 +232,9 @@ pub enum Event {
     Console {
         url: String,
     },
+    Input {
+        source: String,
+    },
     Metrics {
         url: String,
     },
@@ -262,6 +266,7 @@ pub enum Event {
         samples: u32,
         samples_at_rest: u32,
         glitches: u32,
+        input: Option<Box<Tally>>,
         messages: u32,
         messages_at_rest: u32,
         knots: u32,
@@ -293,6 +298,7 @@ impl Event {
             samples: summary.counters.samples,
             samples_at_rest: summary.counters.rest_samples,
             glitches: summary.counters.glitches,
+            input: task.tally().cloned().map(Box::new),
             messages: summary.counters.messages,
             messages_at_rest: summary.counters.rest_messages,
             knots: summary.counters.knots,
@@ -418,6 +424,7 @@ impl Event {
             }
             // With one performance, the line at the end says all.
             Self::Performed { .. } => return None,
+            Self::Input { source } => format!("the hand comes from {source}"),
             Self::Metrics { url } => format!("metrics {url}"),
             Self::Console { url } => format!("the page is at {url}"),
             Self::LinkAsked(_) => return None,

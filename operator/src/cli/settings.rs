@@ -10,20 +10,14 @@ use telemime_endpoint::config::{Kind, Setting, Settings, Sheet};
 use telemime_endpoint::{Fingerprint, cli, logs};
 
 use super::args::{Args, Axes, parse_future_bound, parse_latency};
+use super::input::InputFile;
+use crate::ingest::FPS;
 use crate::placed::Placed;
 use crate::session::SessionConfig;
 
 /// How long a replay rests at its first position, s, and how long the first connection may take, s, unless said otherwise.
 pub(super) const REST_S: f64 = 1.0;
 pub(super) const PATIENCE_S: f64 = 10.0;
-
-/// Settings of the input.
-#[derive(Debug, Clone, Default, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Input {
-    latency_ms: Option<f64>,
-    glitch_gate: Option<bool>,
-}
 
 /// One file, or several.
 #[derive(Debug, Clone, Deserialize)]
@@ -70,7 +64,7 @@ struct File {
     scale: Option<f64>,
     axes: Option<Axes>,
     #[serde(default)]
-    input: Input,
+    input: InputFile,
     gain: Option<f64>,
     future_bound: Option<String>,
     path_bound_m: Option<f64>,
@@ -92,7 +86,10 @@ impl Settings for Args {
         let session = SessionConfig::default();
         Sheet {
             daemon: "operator",
-            alternatives: &[&["replay", "play", "console"], &["learn", "skills"]],
+            alternatives: &[
+                &["replay", "play", "console", "input.source"],
+                &["learn", "skills"],
+            ],
             settings: vec![
                 new("connect", "connect", Kind::Text, "\"robot.example:4433\""),
                 new("identity", "identity", Kind::Text, "\"operator.key\""),
@@ -150,6 +147,34 @@ impl Settings for Args {
                 new("protocol_max", "protocol-max", Kind::Integer, "1").or(1),
                 new("record", "record", Kind::Text, "\"session.mcap\""),
                 new("seed", "seed", Kind::Integer, "0").or(0),
+                new("input.source", "input", Kind::Text, "\"udp:5005\""),
+                new("input.from", "input-from", Kind::Text, "\"192.168.1.7\""),
+                new("input.joint", "joint", Kind::Text, "\"right_hand\"").or("right_hand"),
+                new(
+                    "input.unit",
+                    "unit",
+                    Kind::Choice(&["m", "cm", "mm"]),
+                    "\"m\"",
+                ),
+                new(
+                    "input.time_unit",
+                    "time-unit",
+                    Kind::Choice(&["s", "ms", "us", "ns"]),
+                    "\"s\"",
+                )
+                .or("s"),
+                new("input.grip_range", "grip-range", Kind::Text, "\"0,1\"").or("0,1"),
+                new(
+                    "input.camera",
+                    "camera",
+                    Kind::Text,
+                    "\"571.2,571.2,320,240\"",
+                ),
+                new("input.mirror", "mirror", Kind::Switch, "true").or(false),
+                new("input.frame_size", "frame-size", Kind::Text, "\"640x480\""),
+                new("input.fps", "fps", Kind::Number, "30.0").or(FPS),
+                new("input.engage", "engage", Kind::Switch, "true").or(false),
+                new("input.until_end", "until-end", Kind::Switch, "true").or(false),
                 new("input.latency_ms", "input-latency", Kind::Number, "60.0").or(0.0),
                 new("input.glitch_gate", "glitch-gate", Kind::Switch, "true").or(false),
                 new("metrics", "metrics", Kind::Text, "\"127.0.0.1:9434\""),
@@ -184,7 +209,8 @@ impl Settings for Args {
             (self.learn, self.skill) = (file.learn, file.skills);
         }
         self.matching = self.matching.or(file.matching);
-        if self.replay.is_empty() && self.play.is_none() && self.console.is_none() {
+        let free = self.replay.is_empty() && self.play.is_none() && self.console.is_none();
+        if free && self.input.input.is_none() {
             self.replay = file.replay.map_or_else(Vec::new, Vec::from);
             self.play = file.play;
             self.console = file.console;
@@ -200,6 +226,8 @@ impl Settings for Args {
             self.input_latency = Some(latency.map_err(anyhow::Error::msg)?);
         }
         self.glitch_gate |= file.input.glitch_gate.unwrap_or(false);
+        let other = self.play.is_some() || self.console.is_some() || !self.replay.is_empty();
+        self.input.over(file.input, !other)?;
         if self.frame.is_empty() && self.play.is_some() {
             self.frame = file
                 .frames
@@ -248,7 +276,7 @@ impl Settings for Args {
 
     fn rehearse(&self) -> anyhow::Result<()> {
         let named = self.learn.iter().chain(&self.skill).chain(&self.replay);
-        for path in named.chain(&self.correct) {
+        for path in named.chain(&self.correct).chain(self.input.folder()) {
             std::fs::metadata(path).with_context(|| path.display().to_string())?;
         }
         Ok(())

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use super::{Format, LengthUnit};
 use crate::demonstration::LEAST_SAMPLES;
+use crate::depth::{CameraError, FolderError};
 
 /// Why a raw recording cannot be converted: where, and what to do. The file stands in [`IngestError`].
 #[derive(Debug, thiserror::Error)]
@@ -29,6 +30,15 @@ pub enum Fault {
         /// What the reader said.
         why: String,
     },
+    /// Depth frames are files in a folder.
+    #[error("a depth recording is a folder of 16-bit PNG files; name the folder")]
+    NoFolder,
+    /// The depth frames cannot be read.
+    #[error("{0}")]
+    Depth(#[from] FolderError),
+    /// Depth frames of a size that none can be.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
     /// A line with too many or too few fields.
     #[error(
         "line {line}: {found} fields where {format} has {expected}; correct the line, cut the file there if two \

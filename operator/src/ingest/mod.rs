@@ -25,14 +25,17 @@ mod units;
 #[cfg(test)]
 mod tests;
 
+use std::path::Path;
+
 use nalgebra::Vector3;
 
 pub use columns::Columns;
 pub use error::{Fault, IngestError};
 pub use report::{Cuts, Report, TakeReport};
-pub use units::{Axes, Format, LengthUnit, TimeUnit};
+pub use units::{Axes, Format, LengthUnit, TimeUnit, grip_range};
 
 use crate::demonstration::{LARGEST_EXTENT_M, LEAST_SAMPLES};
+use crate::depth::{Camera, Finder, Folder, Intrinsics};
 use order::Scale;
 use read::{Raw, Raws};
 
@@ -86,6 +89,10 @@ pub struct Options {
     pub axes: Axes,
     /// The gripper's readings when closed and when open.
     pub grip_range: (f64, f64),
+    /// The camera of depth frames; none, a Kinect.
+    pub camera: Option<Intrinsics>,
+    /// In depth frames, the person's right hand is on the left.
+    pub mirror: bool,
     /// A hole longer than this splits, s.
     pub max_gap_s: f64,
     /// Whether glitches stay.
@@ -107,6 +114,8 @@ impl Default for Options {
             length: None,
             axes: Axes::default(),
             grip_range: (0.0, 1.0),
+            camera: None,
+            mirror: false,
             max_gap_s: MAX_GAP_S,
             keep_glitches: false,
             smooth_hz: None,
@@ -162,7 +171,45 @@ pub struct Imported {
 /// # Errors
 /// [`Fault`], one variant a cause.
 pub fn import(bytes: &[u8], options: &Options) -> Result<Imported, Fault> {
-    let mut raws = read::read(bytes, options.format, &options.joint, &options.columns)?;
+    let raws = read::read(bytes, options.format, &options.joint, &options.columns)?;
+    imported(raws, options)
+}
+
+/// The same of a folder of depth frames, in which the hand is looked for.
+///
+/// # Errors
+/// [`Fault`], one variant a cause.
+pub fn import_depth(folder: &Path, options: &Options) -> Result<Imported, Fault> {
+    let folder = Folder::open(folder)?;
+    let unit = options.length.unwrap_or(LengthUnit::Mm);
+    let camera = Camera::new(folder.size(), options.camera, unit.metres(), options.mirror)?;
+    let fps = options.fps.unwrap_or(FPS);
+    let mut finder = Finder::new(camera);
+    let mut samples = Vec::with_capacity(folder.len());
+    for index in 0..folder.len() {
+        let found = finder.find(index as f64 / fps, &folder.frame(index)?);
+        samples.push(Raw {
+            line: index as u64 + 1,
+            t: None,
+            position: found.map(|found| found.position),
+            orientation: None,
+            grip: None,
+            inferred: false,
+        });
+    }
+    let raws = Raws {
+        format: Format::Depth,
+        samples,
+    };
+    // What was found is in metres already.
+    let options = Options {
+        length: Some(LengthUnit::M),
+        ..options.clone()
+    };
+    imported(raws, &options)
+}
+
+fn imported(mut raws: Raws, options: &Options) -> Result<Imported, Fault> {
     let mut report = opening(&raws, options)?;
     if let Some(fps) = report.fps {
         // Frames without the hand count as well: time goes on.
@@ -220,7 +267,7 @@ fn opening(raws: &Raws, options: &Options) -> Result<Report, Fault> {
     let timed = first.is_some_and(|r| r.t.is_some());
     let fps = match (options.fps, raws.format) {
         (Some(fps), _) => Some(fps),
-        (None, Format::Kard) => Some(FPS),
+        (None, Format::Kard | Format::Depth) => Some(FPS),
         (None, _) if !timed => return Err(Fault::NoTime),
         (None, _) => None,
     };
@@ -243,7 +290,7 @@ fn opening(raws: &Raws, options: &Options) -> Result<Report, Fault> {
     }
     Ok(Report {
         format: raws.format,
-        joint: (raws.format != Format::Csv).then(|| options.joint.clone()),
+        joint: matches!(raws.format, Format::Kard | Format::Kinect).then(|| options.joint.clone()),
         time_unit,
         fps,
         length_unit,

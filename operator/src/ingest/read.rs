@@ -57,6 +57,7 @@ pub(super) fn read(
         Format::Kard => kard(&rows, joint, decimal_comma)?,
         Format::Kinect => kinect(&rows, joint, decimal_comma)?,
         Format::Csv => table(&rows, columns, decimal_comma)?,
+        Format::Depth => return Err(Fault::NoFolder),
     };
     if samples.is_empty() {
         return Err(Fault::Empty);

@@ -62,6 +62,11 @@ pub(super) fn find(
         })
 }
 
+/// Whether two names are the same joint.
+pub(crate) fn same(a: &str, b: &str) -> bool {
+    a == b || words(a) == words(b)
+}
+
 /// Its words in lower case, sorted.
 fn words(name: &str) -> Vec<String> {
     let mut words: Vec<String> = vec![String::new()];

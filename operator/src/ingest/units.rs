@@ -16,6 +16,8 @@ pub enum Format {
     Kinect,
     /// A table with a sample a line.
     Csv,
+    /// A folder of depth frames, 16-bit PNG.
+    Depth,
 }
 
 /// A unit of length.
@@ -80,6 +82,18 @@ impl TimeUnit {
             .contains(&(step * best.seconds()))
             .then_some(best)
     }
+}
+
+/// The gripper's readings when closed and when open, as `0,0.08`.
+///
+/// # Errors
+/// One line that says what to write.
+pub fn grip_range(text: &str) -> Result<(f64, f64), String> {
+    let number = |t: &str| t.trim().parse().ok().filter(|v: &f64| v.is_finite());
+    text.split_once(',')
+        .and_then(|(closed, open)| number(closed).zip(number(open)))
+        .filter(|(closed, open)| closed != open)
+        .ok_or_else(|| format!("{text:?} is not two different numbers, as 0,0.08"))
 }
 
 /// A relabelling of axes: which signed source axis each of ours is.
@@ -168,7 +182,7 @@ macro_rules! words {
     };
 }
 
-words!(Format, "kard" => Kard, "kinect" => Kinect, "csv" => Csv);
+words!(Format, "kard" => Kard, "kinect" => Kinect, "csv" => Csv, "depth" => Depth);
 words!(LengthUnit, "m" => M, "cm" => Cm, "mm" => Mm);
 words!(TimeUnit, "s" => S, "ms" => Ms, "us" => Us, "ns" => Ns);
 

@@ -294,4 +294,19 @@ mod tests {
         );
         assert_eq!(pace.interval_s(at(160)), 0.2, "without news it is careful");
     }
+
+    #[test]
+    fn a_queue_on_the_shortest_of_links_is_forgotten() {
+        let mut pace = Pace::new(0.01, 0.2);
+        let at = |i: u32| Stamp::from_secs_f64(0.1 * f64::from(i));
+        // 1 is the least that a robot says that knows it.
+        for i in 1..220 {
+            let delay_ms = if (20..70).contains(&i) { 500 } else { 1 };
+            pace.on_telemetry(at(i), &heard(i, i, delay_ms));
+            if i == 69 {
+                assert_eq!(pace.interval_s(at(i)), 0.2);
+            }
+        }
+        assert_eq!(pace.interval_s(at(219)), 0.01);
+    }
 }

@@ -6,7 +6,7 @@ use telemime_protocol::wire::v1::{Info, Message, RobotControl};
 use super::*;
 use crate::session::SessionConfig;
 
-fn ready() -> Session {
+pub(crate) fn ready() -> Session {
     let mut session = Session::new(SessionConfig::default(), None, 1);
     let info = Info {
         name: "bench".into(),

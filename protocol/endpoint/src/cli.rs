@@ -208,6 +208,10 @@ pub enum Word {
     Yes,
     /// `no`: they are not.
     No,
+    /// `engage`: the tracked hand drives from here.
+    Engage,
+    /// `release`: it does not any more.
+    Release,
     /// `keep`: the performance just driven is worth learning from.
     Keep,
     /// `refine`: learn from what was kept.
@@ -226,7 +230,7 @@ pub const LONGEST_WINDOW: Duration = Duration::from_secs(600);
 pub const ROBOT_WORDS: &str = "stop, reset, blackbox, pair, yes, no or quit";
 
 /// What an operator's terminal understands.
-pub const OPERATOR_WORDS: &str = "stop, reset, keep, refine, save FILE or quit";
+pub const OPERATOR_WORDS: &str = "stop, reset, engage, release, keep, refine, save FILE or quit";
 
 impl Word {
     /// The word of a line, if it is one of `known` ([`ROBOT_WORDS`], [`OPERATOR_WORDS`]).
@@ -244,6 +248,8 @@ impl Word {
             ("pair", span) => seconds(span).ok().map(Self::Pair),
             ("yes", "") => Some(Self::Yes),
             ("no", "") => Some(Self::No),
+            ("engage", "") => Some(Self::Engage),
+            ("release", "") => Some(Self::Release),
             ("keep", "") => Some(Self::Keep),
             ("refine", "") => Some(Self::Refine),
             ("save", file) if !file.is_empty() => Some(Self::Save(file.into())),

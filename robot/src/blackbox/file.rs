@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
+use rustix::fs::statvfs;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use telemime_protocol::wire::DecodeError;
@@ -31,6 +32,9 @@ const MAX_LINE: usize = 256;
 const MAX_HEADER: usize = 16 << 20;
 /// Largest chunk, bytes.
 const MAX_CHUNK: usize = 64 << 20;
+
+/// A stop is not recorded if less than this would be left free, bytes.
+const LEFT_ALONE: u64 = 256 << 20;
 
 /// The circumstances of a record: all that a replay needs besides the ticks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -124,14 +128,52 @@ pub enum ReadError {
 
 /// Why a record was not written.
 #[derive(Debug, thiserror::Error)]
-#[error(
-    "the black box cannot be written to {dir}: {source}; make room, or choose another --black-box"
-)]
-pub struct WriteError {
-    /// The folder.
-    pub dir: PathBuf,
-    /// The system's reason.
-    pub source: std::io::Error,
+pub enum WriteError {
+    /// The system does not.
+    #[error(
+        "the black box cannot be written to {dir}: {source}; make room, or choose another --black-box"
+    )]
+    Io {
+        /// The folder.
+        dir: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The rest of the disk is for others.
+    #[error(
+        "no more stops are written to {dir}: {free} bytes are free on its disk, and {} are left alone; make room, or choose another --black-box",
+        LEFT_ALONE
+    )]
+    Full {
+        /// The folder.
+        dir: PathBuf,
+        /// Bytes free.
+        free: u64,
+    },
+    /// There were enough.
+    #[error(
+        "no more stops are written to {dir} but the last: it has {most} of this robot's; ask for a record, or start the robot again"
+    )]
+    Enough {
+        /// The folder.
+        dir: PathBuf,
+        /// Written so far.
+        most: u32,
+    },
+}
+
+/// A record as bytes, all but its checksum.
+#[derive(Debug, Clone)]
+pub struct Draft(Vec<u8>);
+
+impl Draft {
+    /// The record.
+    pub fn sealed(self) -> Vec<u8> {
+        let Self(mut bytes) = self;
+        let hash = Sha256::digest(&bytes);
+        bytes.extend(hash);
+        bytes
+    }
 }
 
 impl Due {
@@ -190,7 +232,7 @@ impl Header {
         }
     }
 
-    pub(super) fn file(&self, due: Due, chunks: &[&Kept]) -> Vec<u8> {
+    pub(super) fn draft(&self, due: Due, chunks: &[&Kept]) -> Draft {
         let header = codec::encode(self);
         let size = chunks
             .iter()
@@ -214,21 +256,26 @@ impl Header {
             bytes.extend((kept.bytes.len() as u32).to_le_bytes());
             bytes.extend(&kept.bytes);
         }
-        let hash = Sha256::digest(&bytes);
-        bytes.extend(hash);
-        bytes
+        Draft(bytes)
     }
 }
 
-/// Writes `bytes` into `dir` as a file of its own: whole or not at all, and never over another. Returns its path.
+/// Writes `bytes` into `dir` as a file of its own: whole or not at all, and never over another. Returns its path. That of a stop leaves 256 MiB of the
+/// disk free, or is not written.
 ///
 /// # Errors
 /// [`WriteError`].
 pub fn write(dir: &Path, due: Due, bytes: &[u8]) -> Result<PathBuf, WriteError> {
-    let wrong = |source| WriteError {
+    let wrong = |source| WriteError::Io {
         dir: dir.to_owned(),
         source,
     };
+    let free = statvfs(dir).map_err(|e| wrong(e.into()))?;
+    let free = free.f_bavail.saturating_mul(free.f_frsize);
+    if !has_room(due, bytes.len() as u64, free) {
+        let dir = dir.to_owned();
+        return Err(WriteError::Full { dir, free });
+    }
     let name = due.words().replace(' ', "-").to_lowercase();
     let mut file = tempfile::Builder::new()
         .prefix(".blackbox-")
@@ -246,6 +293,10 @@ pub fn write(dir: &Path, due: Due, bytes: &[u8]) -> Result<PathBuf, WriteError> 
         }
     }
     Err(wrong(std::io::ErrorKind::AlreadyExists.into()))
+}
+
+pub(super) fn has_room(due: Due, bytes: u64, free: u64) -> bool {
+    due == Due::Request || free >= bytes.saturating_add(LEFT_ALONE)
 }
 
 /// One more than the highest number in front of a record's name.

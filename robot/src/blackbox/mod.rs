@@ -4,6 +4,7 @@
 //! core's whole state, and lets go of the oldest. [`mod@file`] writes them; [`mod@replay`] runs the same core on them again.
 
 pub mod file;
+mod ration;
 mod recorder;
 pub mod replay;
 mod tap;
@@ -14,10 +15,10 @@ mod ticks;
 mod tests;
 
 pub use self::replay::{Difference, Moment, Replay, ReplayError, Row, replay};
-pub use file::{BlackBox, Header, ReadError, WriteError};
+pub use file::{BlackBox, Draft, Header, ReadError, WriteError};
 pub use recorder::{Due, Feed, Recorder};
 pub use tap::{Tap, Ticked, taps};
-pub use thread::{Asker, Keeper, Saved};
+pub use thread::{Asker, Keeper, News, Saved};
 
 /// What is kept, s: two minutes.
 pub const SPAN_S: f64 = 120.0;

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::v1::{Cause, RobotState};
 
-use super::file::Header;
+use super::file::{Draft, Header};
 use super::tap::{CHUNK_TICKS, Taps, Ticked};
 use super::ticks::{pack, row, width};
 use crate::servo::{ArmFault, CoreState, Order};
@@ -68,7 +68,9 @@ pub struct Recorder {
     open: Option<(Chunk, Vec<u64>)>,
     next_tick: u64,
     gap: bool,
-    /// State changes seen, and of which engagement's skill the hash is.
+    /// Ticks that are not in the record, since somebody asked last.
+    missing: u64,
+    /// State changes seen.
     transitions: Option<u32>,
     stop: Option<(Cause, u64)>,
 }
@@ -86,6 +88,7 @@ impl Recorder {
             open: None,
             next_tick: 0,
             gap: false,
+            missing: 0,
             transitions: None,
             stop: None,
         }
@@ -105,15 +108,20 @@ impl Recorder {
         self.stop.take().map(|(cause, _)| Due::Stop(cause))
     }
 
-    /// What is to be written, as bytes, and for what: `None` while nothing is held.
-    pub fn bytes(&self, due: Due) -> Option<Vec<u8>> {
+    /// Ticks that the record lacks since this was asked for last: it was not drained in time, or more orders came than there is room for.
+    pub fn missing(&mut self) -> u64 {
+        std::mem::take(&mut self.missing)
+    }
+
+    /// What is to be written, and for what: `None` while nothing is held.
+    pub fn draft(&self, due: Due) -> Option<Draft> {
         let open = self
             .open
             .as_ref()
             .filter(|(chunk, _)| !chunk.words.is_empty());
         let open = open.map(|(chunk, _)| self.keep(chunk));
         let chunks: Vec<_> = self.kept.iter().chain(&open).collect();
-        (!chunks.is_empty()).then(|| self.header.file(due, &chunks))
+        (!chunks.is_empty()).then(|| self.header.draft(due, &chunks))
     }
 
     fn keep(&self, chunk: &Chunk) -> Kept {
@@ -129,6 +137,7 @@ impl Recorder {
             // Nothing can be replayed across it: the chunk ends, and the next begins with a state.
             self.close();
             self.gap = !self.kept.is_empty();
+            self.missing += tick.saturating_sub(self.next_tick);
         }
         self.next_tick = tick + 1;
         self.begin_chunk(tick);
@@ -159,6 +168,8 @@ impl Recorder {
             pack(&mut packed, last, self.dof);
             chunk.words.extend(packed);
             *last = words;
+        } else {
+            self.missing += 1;
         }
         self.watch(ticked)
     }

@@ -97,7 +97,7 @@ pub fn replay(
     let rig = record.rig()?;
     // Nothing is freed elsewhere here: what the core lets go of is taken out after every tick.
     let (spent, mut spent_out) = rtrb::RingBuffer::new(64);
-    let mut core = rig.core(0.0, spent);
+    let mut core = rig.core(None, spent);
     let dof = rig.arm.dof();
     let mut telling = Telling::default();
     let mut done = Replay {

@@ -8,10 +8,11 @@ use telemime_protocol::predict::{Bend, Forecast, HandState, Held, Params};
 use telemime_protocol::spline::{BSpline, End};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, RobotState};
+use telemime_sim::arm::ContactPlane;
 
 use super::ticks::width;
 use super::*;
-use crate::control::ControlConfig;
+use crate::control::{BarrierConfig, ControlConfig, Plane};
 use crate::driver::{DriverArm, DriverConfig, Heard, Sent};
 use crate::rig::{Rig, RigOptions};
 use crate::servo::{
@@ -72,7 +73,7 @@ impl Bench {
             let (setpoints, hears) = rtrb::RingBuffer::new(64);
             let state = ArmState {
                 q: rig.home,
-                opening: 0.7,
+                opening: Some(0.7),
                 ..ArmState::default()
             };
             let config = DriverConfig {
@@ -81,7 +82,10 @@ impl Bench {
             };
             let arm = DriverArm::new(rig.arm.clone(), config, state, heard, setpoints);
             let driver = Sluggish { says, hears, state };
-            (rig.servo_before(Box::new(arm), 0.7, rings), Some(driver))
+            (
+                rig.servo_before(Box::new(arm), Some(0.7), rings),
+                Some(driver),
+            )
         } else {
             (rig.servo(rings), None)
         };
@@ -179,7 +183,7 @@ impl Bench {
     /// What was written for `cause`.
     fn record(&mut self) -> (Due, BlackBox) {
         let due = self.recorder.drain().or(self.due).unwrap();
-        let bytes = self.recorder.bytes(due).unwrap();
+        let bytes = self.recorder.draft(due).unwrap().sealed();
         (
             due,
             BlackBox::parse(Path::new("a.blackbox"), &bytes).unwrap(),
@@ -257,6 +261,41 @@ fn a_record_that_begins_in_the_middle_of_a_motion_replays_from_there() {
     );
     assert!(told(&shown, "the record begins: Engaged"));
     assert!(told(&shown, "the brake was pulled: OperatorStop"));
+}
+
+#[test]
+fn a_motion_pressed_against_a_surface_before_a_plane_replays_to_the_bit() {
+    let start = Rig::load(&RigOptions::default()).unwrap().workspace.home_m;
+    // The hand goes far to the negative y. 80 mm behind the surface neither tip nor links may go any farther, their hulls among them.
+    let surface_m = start.y - 0.05;
+    let barrier = BarrierConfig::default()
+        .with_plane(Plane::new(Vector3::y(), surface_m - 0.08).unwrap())
+        .unwrap();
+    let options = RigOptions {
+        control: ControlConfig {
+            barrier,
+            ..ControlConfig::default()
+        },
+        contact: Some(ContactPlane::new(Vector3::y(), surface_m).unwrap()),
+        ..RigOptions::default()
+    };
+    let mut bench = Bench::new(&options, SPAN_S);
+    bench.mirror(3.0);
+    bench.ticks(1500);
+    let (_, record) = bench.record();
+    let (reports, shown) = again(&record);
+    assert_eq!(shown.difference, None);
+    assert_eq!(reports, bench.reports);
+    let pressed = reports.iter().filter(|r| r.tip_m.y < surface_m).count();
+    let behind = |r: &&Report| r.target_m.y < surface_m - 0.08;
+    let kept = reports.iter().filter(behind).count();
+    assert!(pressed > 1000 && kept > 100, "{pressed}, {kept}");
+    assert!(reports.iter().all(|r| r.reference_m.y > surface_m - 0.08));
+    assert!(told(&shown, "a limit acted on"), "{:#?}", shown.moments);
+    // What pushed the arm is not in the record, and what it did is: without the planes the same inputs decide otherwise.
+    let mut open = record;
+    open.header.control.barrier = BarrierConfig::default();
+    assert!(again(&open).1.difference.is_some());
 }
 
 #[test]
@@ -353,6 +392,12 @@ fn ticks_that_are_lost_are_a_gap_and_not_a_difference() {
     let (_, record) = bench.record();
     let (_, shown) = again(&record);
     assert_eq!((shown.difference, shown.gaps), (None, 1));
+    // The rings hold 4096 of the 6000; the others wait for a state to begin with again.
+    let missing = bench.recorder.missing();
+    let lacking = bench.reports.len() as u64 + 6000 - shown.ticks;
+    assert_eq!(missing, lacking);
+    assert!(missing >= 6000 - 4096 - 50, "{missing}");
+    assert_eq!(bench.recorder.missing(), 0);
 }
 
 #[test]
@@ -389,7 +434,7 @@ fn what_is_foreign_cut_off_or_damaged_is_refused() {
     bench.mirror(0.5);
     bench.ticks(1200);
     let due = bench.recorder.drain().or(bench.due).unwrap();
-    let good = bench.recorder.bytes(due).unwrap();
+    let good = bench.recorder.draft(due).unwrap().sealed();
     let path = Path::new("a.blackbox");
     let read = |bytes: &[u8]| BlackBox::parse(path, bytes);
     assert!(read(&good).is_ok());
@@ -469,6 +514,9 @@ fn files_are_whole_numbered_and_never_overwritten() {
         2,
         "and nothing else"
     );
+    assert!(file::has_room(due, 1000, 1000 + (256 << 20)));
+    assert!(!file::has_room(due, 1000, 999 + (256 << 20)));
+    assert!(file::has_room(Due::Request, 1000, 1000), "who asks decides");
     let gone = dir.path().join("gone");
     let error = file::write(&gone, due, b"three").unwrap_err();
     assert!(

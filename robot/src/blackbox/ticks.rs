@@ -50,7 +50,7 @@ impl Outcome {
         let numbers = r.qd.iter().chain(r.qdd.iter()).chain(setpoint.tau.iter());
         let numbers = numbers.chain(report.tip_m.iter()).chain(q.coords.iter());
         let rest = [
-            setpoint.opening,
+            setpoint.opening.unwrap_or(f64::NAN),
             report.jerk_m_s3,
             report.orientation_error_rad,
             report.age_s,
@@ -88,14 +88,15 @@ fn fold(hash: u64, word: u64) -> u64 {
 }
 
 fn put_arm(row: &mut Vec<u64>, arm: &ArmState, dof: usize) {
-    row.push(arm.opening.to_bits());
+    // NaN is no opening.
+    row.push(arm.opening.unwrap_or(f64::NAN).to_bits());
     row.extend(arm.q.iter().take(dof).map(|v| v.to_bits()));
     row.extend(arm.qd.iter().take(dof).map(|v| v.to_bits()));
 }
 
 fn take_arm(row: &[u64], dof: usize) -> ArmState {
     let mut arm = ArmState {
-        opening: f64::from_bits(row[0]),
+        opening: Some(f64::from_bits(row[0])).filter(|opening| !opening.is_nan()),
         ..ArmState::default()
     };
     for i in 0..dof {

@@ -1,6 +1,7 @@
 //! Every tick to a file, off the servo's thread; or a recording that viewers open.
 
-use std::io::Write as _;
+use std::fs::File;
+use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 
@@ -33,6 +34,27 @@ pub(super) fn scribe(path: Option<&Path>, rig: &Rig, log: &Log) -> anyhow::Resul
     Ok(Some(Scribe::start(path, rig, say)?))
 }
 
+/// A new file at `path`; where one is, at the same with the next free number.
+fn fresh(path: &Path) -> std::io::Result<(PathBuf, File)> {
+    let mut fresh = path.to_owned();
+    for n in 2.. {
+        match File::create_new(&fresh) {
+            Ok(file) => return Ok((fresh, file)),
+            Err(e) if e.kind() == ErrorKind::AlreadyExists && path.file_stem().is_some() => {
+                let mut name = path.file_stem().unwrap_or_default().to_owned();
+                name.push(format!("-{n}"));
+                if let Some(extension) = path.extension() {
+                    name.push(".");
+                    name.push(extension);
+                }
+                fresh.set_file_name(name);
+            }
+            Err(e) => return Err(e),
+        }
+    }
+    Err(ErrorKind::AlreadyExists.into())
+}
+
 /// Writes ticks to a CSV file from a thread of its own.
 pub(super) struct TickRecorder {
     path: PathBuf,
@@ -43,8 +65,15 @@ pub(super) struct TickRecorder {
 
 impl TickRecorder {
     fn start(path: &Path, dof: usize) -> anyhow::Result<Self> {
-        let file = std::fs::File::create(path)
-            .with_context(|| format!("cannot write {}", path.display()))?;
+        let (fresh, file) =
+            fresh(path).with_context(|| format!("cannot write {}", path.display()))?;
+        if fresh != path {
+            telemime_endpoint::logs::note(&format!(
+                "{} is there already; the ticks go to {}",
+                path.display(),
+                fresh.display()
+            ));
+        }
         let (queue, reports) = sync_channel::<Report>(QUEUE);
         let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
             let mut out = std::io::BufWriter::new(file);
@@ -54,7 +83,7 @@ impl TickRecorder {
             for r in reports {
                 write!(out, "{},{},{:?},{},{:.6},{}", r.tick, r.at.0, r.state, r.engagement.number, r.age_s, r.clamps)?;
                 let q = &r.orientation;
-                let turn = [q.w, q.i, q.j, q.k, r.opening, r.jerk_m_s3];
+                let turn = [q.w, q.i, q.j, q.k, r.opening.unwrap_or(f64::NAN), r.jerk_m_s3];
                 r.tip_m.iter().chain(&r.target_m).chain(&turn).try_for_each(|v| write!(out, ",{v:.6}"))?;
                 r.q.iter().take(dof).try_for_each(|v| write!(out, ",{v:.6}"))?;
                 writeln!(out)?;
@@ -62,7 +91,7 @@ impl TickRecorder {
             out.flush()
         })?;
         Ok(Self {
-            path: path.to_owned(),
+            path: fresh,
             queue,
             thread,
             lost: 0,
@@ -94,5 +123,35 @@ impl TickRecorder {
             ));
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_earlier_recording_is_not_written_over() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["ticks.csv", "ticks", "two.dots.csv"] {
+            let path = dir.path().join(name);
+            std::fs::write(&path, "an hour of ticks").unwrap();
+            let again: Vec<_> = (0..2).map(|_| fresh(&path).unwrap().0).collect();
+            assert!(again[0] != path && again[0] != again[1], "{again:?}");
+            assert_eq!(again[1].extension(), path.extension());
+            assert_eq!(std::fs::read_to_string(&path).unwrap(), "an hour of ticks");
+        }
+        assert_eq!(
+            fresh(&dir.path().join("new.csv")).unwrap().0,
+            dir.path().join("new.csv")
+        );
+        assert!(
+            fresh(&dir.path().join("ticks-2.csv"))
+                .unwrap()
+                .0
+                .ends_with("ticks-2-2.csv")
+        );
+        let error = fresh(&dir.path().join("gone").join("ticks.csv")).unwrap_err();
+        assert_eq!(error.kind(), ErrorKind::NotFound);
     }
 }

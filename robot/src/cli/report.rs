@@ -10,7 +10,7 @@ use telemime_endpoint::pairing::Candidate;
 use telemime_endpoint::reception::{Quantiles, Received};
 use telemime_endpoint::recording::{self, Outcome};
 
-use crate::blackbox::{Due, Saved};
+use crate::blackbox::News;
 use crate::desk::Progress;
 use crate::servo::thread::Times;
 use crate::servo::{ArmFault, Locked, Realtime, Report};
@@ -188,19 +188,24 @@ impl Log {
 }
 
 impl Log {
-    /// What became of a record.
-    pub(super) fn black_box(&self, due: Due, saved: &Saved) {
-        let why = due.words();
-        let text = match saved {
-            Ok(path) => format!("black box ({why}): {}", path.display()),
-            Err(e) => format!("black box ({why}): {e}"),
+    /// What became of a record, or is missing in it.
+    pub(super) fn black_box(&self, news: &News) {
+        let (why, file, error) = match news {
+            News::Saved(due, Ok(path)) => (due.words(), Some(path.clone()), None),
+            News::Saved(due, Err(e)) => (due.words(), None, Some(e.to_string())),
+            News::Missing(ticks) => {
+                let missing = format!(
+                    "{ticks} ticks are missing in the record: this computer was too slow for it, or too many orders came at once"
+                );
+                ("gap".to_owned(), None, Some(missing))
+            }
         };
-        let event = Event::BlackBox {
-            why,
-            file: saved.as_ref().ok().cloned(),
-            error: saved.as_ref().err().map(ToString::to_string),
-        };
-        self.say(&event, || text);
+        let what = file.as_ref().map(|path| path.display().to_string());
+        let text = format!(
+            "black box ({why}): {}",
+            what.or(error.clone()).unwrap_or_default()
+        );
+        self.say(&Event::BlackBox { why, file, error }, || text);
     }
 
     pub(super) fn recording(&self, outcome: &Outcome) {

@@ -14,7 +14,7 @@ use telemime_sim::arm::{DeadTime, LoadOptions};
 
 use super::{Args, surroundings};
 use crate::control::{BarrierConfig, ControlConfig, FilterConfig, LimitedFilter};
-use crate::driver::PATIENCE_S;
+use crate::driver::{DriverConfig, FASTEST_HZ, PATIENCE_S, PatienceError};
 use crate::rig::{Rig, RigOptions};
 use crate::servo::Priority;
 
@@ -48,6 +48,7 @@ struct File {
     contact_plane: Option<[f64; 4]>,
     dead_time_s: Option<f64>,
     bandwidth_rad_s: Option<f64>,
+    stiffness_nm_rad: Option<f64>,
     protocol_max: Option<u16>,
     record: Option<PathBuf>,
     driver: Option<String>,
@@ -134,6 +135,7 @@ impl Settings for Args {
                 ),
                 new("dead_time_s", "dead-time", Kind::Number, "0.02").or(control.dead_time_s),
                 new("bandwidth_rad_s", "bandwidth", Kind::Number, "40.0").or(control.omega),
+                new("stiffness_nm_rad", "stiffness", Kind::Number, "200.0"),
                 new("protocol_max", "protocol-max", Kind::Integer, "1").or(1),
                 new("record", "record", Kind::Text, "\"ticks.csv\""),
                 new("driver", "driver", Kind::Text, "\"python3 arm.py\""),
@@ -181,6 +183,7 @@ impl Settings for Args {
         self.contact_plane = self.contact_plane.or(file.contact_plane);
         self.dead_time = self.dead_time.or(file.dead_time_s);
         self.bandwidth = self.bandwidth.or(file.bandwidth_rad_s);
+        self.stiffness = self.stiffness.or(file.stiffness_nm_rad);
         self.protocol_max = self.protocol_max.or(file.protocol_max);
         self.record = self.record.or(file.record);
         self.driver = self.driver.or(file.driver);
@@ -197,7 +200,8 @@ impl Settings for Args {
         surroundings::contact(self)?;
         self.fingerprints()?;
         admin::own_name(self.name.as_deref())?;
-        self.patience_s()?;
+        // How often a driver speaks is not known before it does.
+        self.driving(FASTEST_HZ)?;
         self.realtime.map(Priority::new).transpose()?;
         cli::versions(self.protocol_max)?;
         let control = self.control()?;
@@ -237,14 +241,9 @@ impl Args {
         Ok(given.collect::<Result<_, _>>()?)
     }
 
-    /// How long a driver may be silent, s.
-    pub(super) fn patience_s(&self) -> anyhow::Result<f64> {
-        let patience_s = self.driver_patience.unwrap_or(PATIENCE_S);
-        ensure!(
-            (0.01..=10.0).contains(&patience_s),
-            "--driver-patience {patience_s} s: from 10ms to 10s"
-        );
-        Ok(patience_s)
+    /// How a driver is waited for that tells its state `rate_hz` times a second.
+    pub(super) fn driving(&self, rate_hz: f64) -> Result<DriverConfig, PatienceError> {
+        DriverConfig::new(rate_hz, self.driver_patience.unwrap_or(PATIENCE_S))
     }
 
     /// The arm and how it is driven, as far as no driver says more.
@@ -270,6 +269,7 @@ impl Args {
         Ok(ControlConfig {
             dead_time_s: self.dead_time.unwrap_or(default.dead_time_s),
             omega: self.bandwidth.unwrap_or(default.omega),
+            stiffness: self.stiffness,
             barrier: surroundings::barrier(self)?,
             ..default
         })
@@ -311,8 +311,8 @@ mod tests {
             let (said, not) = (with(key).control().unwrap(), nothing.control().unwrap());
             assert_eq!(format!("{said:?}"), format!("{not:?}"), "{key}");
         }
-        let patience = with("driver_patience_s").patience_s().unwrap();
-        assert_eq!(patience, nothing.patience_s().unwrap());
+        let driving = with("driver_patience_s").driving(250.0).unwrap();
+        assert_eq!(driving, nothing.driving(250.0).unwrap());
         let versions = |args: &Args| cli::versions(args.protocol_max).unwrap();
         assert_eq!(versions(&with("protocol_max")), versions(&nothing));
         assert_eq!(with("listen").listen, LISTEN.parse().ok());

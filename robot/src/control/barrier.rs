@@ -24,6 +24,12 @@ const HARD_M: f64 = 0.004;
 /// Room at which the first stage allows no approach, m.
 const SOFT_M: f64 = HARD_M + 0.001;
 
+/// So much behind a plane, m, a target counts as before it.
+const CLIPPED_M: f64 = 1e-9;
+
+/// Two planes at 20° to one another are come to terms with in as many rounds.
+const CLIP_ROUNDS: u32 = 200;
+
 /// A way to a stop that takes more looks than this is too long to take.
 const LOOKS: usize = 16;
 
@@ -270,13 +276,20 @@ impl Barrier {
         self.known = known;
     }
 
-    /// The nearest place that no plane excludes, and whether that is another one.
+    /// A place near `target` that no plane excludes, and whether that is another one: the nearest, where one plane is in the way or several at right
+    /// angles. At oblique planes it is the limit of moving it back over one after the other; where planes leave no room it is behind some of them.
     pub(super) fn clip(&self, target: Vector3<f64>) -> (Vector3<f64>, bool) {
         let mut clipped = target;
-        for plane in self.config.planes.iter().flatten() {
-            let short = SOFT_M - plane.height_m(&clipped);
-            if short > 0.0 {
-                clipped += plane.normal * short;
+        for _ in 0..CLIP_ROUNDS {
+            let before = clipped;
+            for plane in self.config.planes.iter().flatten() {
+                let short = SOFT_M - plane.height_m(&clipped);
+                if short > CLIPPED_M {
+                    clipped += plane.normal * short;
+                }
+            }
+            if clipped == before {
+                break;
             }
         }
         (clipped, clipped != target)
@@ -528,6 +541,42 @@ mod tests {
             }
             assert!((braking(v, a, h) - gone).abs() < 1e-12);
         }
+    }
+
+    #[test]
+    fn a_target_behind_oblique_planes_is_moved_before_all_of_them() {
+        let arm = crate::rig::Rig::load(&crate::rig::RigOptions::default()).unwrap();
+        // A wedge of 60°: what is moved over one of its sides comes to lie behind the other.
+        let side = |y: f64| Plane::new(Vector3::new(0.0, y, 0.5), 0.05).unwrap();
+        let config = BarrierConfig::default()
+            .with_plane(side(0.75_f64.sqrt()))
+            .and_then(|config| config.with_plane(side(-(0.75_f64.sqrt()))))
+            .unwrap();
+        let barrier = |config: &BarrierConfig| {
+            let (model, home) = (arm.arm.clone(), arm.home);
+            Barrier::new(model, config, Joints::repeat(10.0), &home, 1e-3)
+        };
+        let Ok(wedge) = barrier(&config) else {
+            panic!("the tip starts within");
+        };
+        for y in [-0.5, -0.1, 0.0, 0.03, 0.4] {
+            let (at, moved) = wedge.clip(Vector3::new(0.3, y, -0.3));
+            assert!(moved);
+            for plane in config.planes.iter().flatten() {
+                let height_m = plane.height_m(&at);
+                assert!(height_m >= SOFT_M - 2.0 * CLIPPED_M, "{y}: {height_m}");
+            }
+        }
+        let within = Vector3::new(0.3, 0.0, 1.0);
+        assert_eq!(wedge.clip(within), (within, false));
+        // Planes that leave no room are no endless loop.
+        let up = Plane::new(Vector3::z(), 0.1).unwrap();
+        let mut walls = barrier(&BarrierConfig::default().with_plane(up).unwrap()).unwrap();
+        walls.config = walls
+            .config
+            .with_plane(Plane::new(-Vector3::z(), 0.1).unwrap())
+            .unwrap();
+        assert!(walls.clip(Vector3::zeros()).0.z.is_finite());
     }
 
     #[test]

@@ -5,20 +5,23 @@ use std::sync::Arc;
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 use telemime_sim::arm::{
-    ArmModel, DeadTime, DeadTimeError, Joints, MAX_DEAD_TIME_S, PlantError, check_start,
+    ArmModel, DeadTime, DeadTimeError, Dynamics, Joints, MAX_DEAD_TIME_S, PlantError, check_start,
 };
 
 use super::barrier::Barrier;
 use super::ik::{DifferentialIk, IkState, quaternion};
 use super::turn::checked;
 use super::{
-    BarrierConfig, BarrierError, CartesianLimits, ComputedTorque, FilterConfig, FilterError,
-    FilterState, IkConfig, JointReference, LimitedFilter, TurnFilter, TurnLimits, TurnState,
+    BarrierConfig, BarrierError, CartesianLimits, FilterConfig, FilterError, FilterState, IkConfig,
+    JointReference, Law, LimitedFilter, TorqueControl, TurnFilter, TurnLimits, TurnState,
     joint_accelerations,
 };
 
 /// The filter's reference may lead the joints' reference by this much, m; beyond, the arm cannot follow and the filter waits for it.
 const LEASH_M: f64 = 0.002;
+
+/// A joint's natural frequency is at most this share of the tick rate.
+const QUICKEST: f64 = 0.2;
 
 /// The same for the orientation, rad. Longer: what an arm with too few axes lacks must not hold up the rest.
 const LEASH_RAD: f64 = 0.05;
@@ -34,6 +37,10 @@ pub struct ControlConfig {
     pub turn_limits: TurnLimits,
     /// Bandwidth of the joints' torque control, rad/s.
     pub joint_bandwidth: f64,
+    /// Joint impedance instead: the stiffness of the joint of the largest effort limit, N·m/rad or N/m; of the others in proportion to theirs,
+    /// less where that is too quick for the tick.
+    #[serde(default)]
+    pub stiffness: Option<f64>,
     /// How fast an error of the tip's orientation is closed, 1/s: against the one followed, or else the one at the last reset.
     pub orientation_gain: f64,
     /// How fast idle joints return to the start posture, 1/s.
@@ -63,6 +70,7 @@ impl Default for ControlConfig {
                 j_max: 12_500.0,
             },
             joint_bandwidth: 80.0,
+            stiffness: None,
             orientation_gain: 8.0,
             posture_gain: 1.0,
             dead_time_s: 0.0,
@@ -94,6 +102,16 @@ pub enum ControlError {
         what: &'static str,
         /// The value.
         value: f64,
+    },
+    /// A stiffness that is none, or that the tick is too slow for.
+    #[error(
+        "stiffness {value} N·m/rad: more than 0, and at most {most:.0} for this arm at its start posture and this tick"
+    )]
+    Stiffness {
+        /// The value.
+        value: f64,
+        /// The most that is stable.
+        most: f64,
     },
     /// The start posture is not within the arm's limits.
     #[error(transparent)]
@@ -278,7 +296,7 @@ pub struct Controller {
     turns: bool,
     ik: DifferentialIk,
     setpoints: DeadTime<JointReference>,
-    torque: ComputedTorque,
+    torque: TorqueControl,
     counts: ClampCounts,
 }
 
@@ -340,6 +358,14 @@ impl Controller {
             ..filter_config
         };
         let turn = TurnFilter::new(turn_config, ik.orientation()).map_err(ControlError::Turn)?;
+        let law = match config.stiffness {
+            None => Law::Computed {
+                bandwidth: config.joint_bandwidth,
+            },
+            Some(value) => Law::Impedance {
+                stiffness: springs(&arm, &q, value, config.dt_s)?,
+            },
+        };
         let setpoints = DeadTime::new(config.dead_time_s, config.dt_s, *ik.reference())?;
         Ok(Self {
             arm,
@@ -350,7 +376,7 @@ impl Controller {
             turns: false,
             ik,
             setpoints,
-            torque: ComputedTorque::new(config.joint_bandwidth),
+            torque: TorqueControl::new(law),
             counts: ClampCounts::default(),
         })
     }
@@ -530,4 +556,37 @@ impl Controller {
         };
         (speed_scale > 0.0, unit)
     }
+}
+
+/// Springs of this stiffness at the strongest joint, of each joint in N·m/rad: softer where so little inertia hangs on one that the tick
+/// would be too slow for its share.
+pub(super) fn springs(
+    arm: &ArmModel,
+    q: &Joints,
+    value: f64,
+    dt_s: f64,
+) -> Result<Joints, ControlError> {
+    let effort = arm.per_joint(|j| j.effort);
+    let strongest = effort.imax();
+    let mut dynamics = Dynamics::new();
+    dynamics.update(arm, q);
+    let n = arm.dof();
+    let inertia = dynamics.mass_matrix();
+    let inverse = inertia.view((0, 0), (n, n)).clone_owned().try_inverse();
+    let mut most = Joints::zeros();
+    if let Some(inverse) = inverse {
+        for i in 0..n {
+            // The least inertia a joint shows: that of a push against it while all others are free.
+            most[i] = (QUICKEST / dt_s).powi(2) / inverse[(i, i)];
+        }
+    }
+    let shares = effort * (value / effort[strongest]);
+    let most_there = most[strongest];
+    if !(value > 0.0 && value <= most_there) {
+        return Err(ControlError::Stiffness {
+            value,
+            most: most_there,
+        });
+    }
+    Ok(shares.zip_map(&most, f64::min))
 }

@@ -22,5 +22,5 @@ pub use controller::{
 pub use filter::{FilterConfig, FilterError, FilterState, LimitedFilter};
 pub use ik::{IkConfig, JointReference, JointStep};
 pub use posture::{CartesianLimits, home_posture, joint_accelerations, workspace_radius};
-pub use torque::ComputedTorque;
+pub use torque::{Law, TorqueControl};
 pub use turn::{TurnFilter, TurnLimits, TurnState};

@@ -9,19 +9,29 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use rustix::process::{Pid, Signal, kill_process_group};
+use rustix::process::{Pid, Signal, WaitId, WaitIdOptions, kill_process_group, waitid};
+use telemime_endpoint::Mono;
 use telemime_sim::arm::{ArmModel, Joints};
 
 use super::line::{self, Hello, LineError, Said};
-use super::{DriverArm, DriverConfig, Heard, Sent};
+use super::{DriverArm, DriverConfig, Heard, REMEMBERED, Sent};
 use crate::servo::thread::{now, wait_until};
 use crate::servo::{ArmFault, ArmState};
 
 /// A driver gets this long to say hello and where its joints are.
 const GREETING: Duration = Duration::from_secs(10);
 
-/// And this long to end once it is told to, before it is killed.
-const FAREWELL: Duration = Duration::from_secs(2);
+/// And this long, ns, to end once it is told to, before it is killed.
+const FAREWELL_NS: i64 = 2_000_000_000;
+
+/// How often it is looked at meanwhile, ns.
+const LOOK_NS: i64 = 5_000_000;
+
+/// Between its first state and its first setpoint a joint may move by this much, rad or m: by so much the setpoint leaps.
+const DRIFT: f64 = 0.01;
+
+/// A joint that is faster when it is to be given its first setpoint, rad/s or m/s, is moved by somebody.
+const DRIFTING: f64 = 0.05;
 
 /// Longest line, bytes.
 const MAX_LINE: u64 = 1 << 16;
@@ -29,8 +39,9 @@ const MAX_LINE: u64 = 1 << 16;
 /// States on their way to the servo.
 const STATES: usize = 4096;
 
-/// Setpoints on their way to the driver: more than wait while it is not behind.
-const SETPOINTS: usize = 256;
+/// Setpoints on their way to the driver: as many as are made in the longest patience. None is then lost before the driver has failed, and what it
+/// reads next is always the newest.
+const SETPOINTS: usize = REMEMBERED;
 
 /// Why there is no driver.
 #[derive(Debug, thiserror::Error)]
@@ -75,6 +86,26 @@ pub enum DriverError {
         /// Its words.
         text: String,
     },
+    /// It has fallen silent before it was given a setpoint.
+    #[error("--driver `{command}`: it has told its joints' state, and then not any more for {} s: it must tell it all the time (docs/driver.md)", GREETING.as_secs())]
+    Mute {
+        /// The command.
+        command: String,
+    },
+    /// Its arm is not where it was.
+    #[error(
+        "--driver `{command}`: joint {joint} has moved by {by:.4} since the driver began, at {speed:.3} a second now: hold the arm still, and start the robot again"
+    )]
+    Moved {
+        /// The command.
+        command: String,
+        /// The joint, counted from 0.
+        joint: usize,
+        /// By how much, rad or m.
+        by: f64,
+        /// How fast it says that it is, rad/s or m/s.
+        speed: f64,
+    },
     /// It has other joints.
     #[error(
         "--driver `{command}` has the joints {given}, and the arm {wanted}: give the --urdf and --tip of the driver's arm"
@@ -108,11 +139,14 @@ pub struct Bridge {
     child: Child,
     stdin: Option<ChildStdin>,
     armed: Arc<AtomicBool>,
+    latest: Latest,
     heard: Option<rtrb::Consumer<Heard>>,
     words: Words,
-    ended: Receiver<()>,
     writer: Option<JoinHandle<()>>,
 }
+
+/// Where the arm was when it was last heard of, and when that was.
+type Latest = Arc<Mutex<Option<(Mono, ArmState)>>>;
 
 /// What a fault was in the driver's own words.
 #[derive(Debug, Clone, Default)]
@@ -154,22 +188,20 @@ impl Bridge {
         let stdout = stdout.expect("it was asked to be piped");
         let (states, heard) = rtrb::RingBuffer::new(STATES);
         let (greet, greetings) = sync_channel(2);
-        let (at_end, ended) = sync_channel::<()>(1);
+        let latest = Latest::default();
         let (armed, words) = (Arc::new(AtomicBool::new(false)), Words::default());
         let mut reader = Reader {
             stdout: BufReader::new(stdout),
             line: Vec::new(),
             lines: 0,
             armed: armed.clone(),
+            latest: latest.clone(),
             states,
             words: words.clone(),
         };
         std::thread::Builder::new()
             .name("driver-in".into())
-            .spawn(move || {
-                reader.run(&greet);
-                drop(at_end);
-            })
+            .spawn(move || reader.run(&greet))
             .map_err(no_start)?;
         let mut bridge = Self {
             command: command.to_owned(),
@@ -182,9 +214,9 @@ impl Bridge {
             child,
             stdin,
             armed,
+            latest,
             heard: Some(heard),
             words,
-            ended,
             writer: None,
         };
         // What is dropped on the way out ends the process.
@@ -251,13 +283,18 @@ impl Bridge {
         self.words.clone()
     }
 
-    /// The servo's end, for an `arm` that [fits](Self::fits). To be called once; from then on what the driver says is for the servo.
+    /// The servo's end, for an `arm` that [fits](Self::fits) and is still where it was. To be called once; from then on what the driver says is for the servo.
     ///
     /// # Errors
-    /// [`DriverError::Start`] if the system gives no thread.
-    pub fn arm(&mut self, arm: Arc<ArmModel>, patience_s: f64) -> Result<DriverArm, DriverError> {
+    /// [`DriverError::Moved`], [`DriverError::Mute`], [`DriverError::Ended`] or [`DriverError::Fault`], and [`DriverError::Start`] if the system gives no thread.
+    pub fn arm(
+        &mut self,
+        arm: Arc<ArmModel>,
+        config: DriverConfig,
+    ) -> Result<DriverArm, DriverError> {
+        self.stays()?;
         let (setpoints, sent) = rtrb::RingBuffer::new(SETPOINTS);
-        let (rate_hz, dof) = (self.hello.rate_hz, arm.dof());
+        let (rate_hz, dof) = (config.rate_hz, arm.dof());
         if let Some(stdin) = self.stdin.take() {
             let writer = std::thread::Builder::new()
                 .name("driver-out".into())
@@ -273,11 +310,70 @@ impl Bridge {
             .take()
             .unwrap_or_else(|| rtrb::RingBuffer::new(1).1);
         self.armed.store(true, Ordering::SeqCst);
-        let config = DriverConfig {
-            rate_hz,
-            patience_s,
-        };
         Ok(DriverArm::new(arm, config, self.state, heard, setpoints))
+    }
+}
+
+impl Bridge {
+    /// Waits for news of the arm, and compares it with where it was when the driver began: meanwhile an arm was loaded, and somebody may have moved this one.
+    fn stays(&mut self) -> Result<(), DriverError> {
+        let asked = now();
+        let mut at = asked;
+        let command = || self.command.clone();
+        let state = loop {
+            let latest = *self.latest.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Some((_, state)) = latest.filter(|(at, _)| *at > asked) {
+                break state;
+            }
+            // Before the arm is handed over only faults are in this ring.
+            if let Some(Heard::Fault(fault)) = self.heard.as_mut().and_then(|ring| ring.pop().ok())
+            {
+                return Err(match fault {
+                    ArmFault::Ended => DriverError::Ended { command: command() },
+                    fault => DriverError::Fault {
+                        command: command(),
+                        text: self.words.get().unwrap_or_else(|| fault.to_string()),
+                    },
+                });
+            }
+            if at.secs_since(asked) > GREETING.as_secs_f64() {
+                return Err(DriverError::Mute { command: command() });
+            }
+            at = wait_until(at.0 + LOOK_NS);
+        };
+        for joint in 0..self.hello.joints.len() {
+            let (by, speed) = (state.q[joint] - self.state.q[joint], state.qd[joint]);
+            if !(by.abs() <= DRIFT && speed.abs() <= DRIFTING) {
+                return Err(DriverError::Moved {
+                    command: command(),
+                    joint,
+                    by,
+                    speed,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// Waits, for [`FAREWELL_NS`] at most, until the process has ended and nobody holds the writer up; says whether.
+    fn is_over(&self) -> bool {
+        let mut at = now();
+        let until = at.0 + FAREWELL_NS;
+        // Its number stays its own until it is waited for at last.
+        let ended = || {
+            let look = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
+            let status = waitid(WaitId::Pid(Pid::from_child(&self.child)), look);
+            !matches!(status, Ok(None))
+        };
+        loop {
+            if ended() && self.writer.as_ref().is_none_or(JoinHandle::is_finished) {
+                return true;
+            }
+            if at.0 >= until {
+                return false;
+            }
+            at = wait_until(at.0 + LOOK_NS);
+        }
     }
 }
 
@@ -285,16 +381,16 @@ impl Drop for Bridge {
     fn drop(&mut self) {
         // The writer has ended with the servo, and closed the driver's input; without one it is closed here.
         drop(self.stdin.take());
-        if matches!(
-            self.ended.recv_timeout(FAREWELL),
-            Err(RecvTimeoutError::Timeout)
-        ) {
-            // It, and what it has started; all of that may be gone already.
+        if !self.is_over() {
+            // It, and what it has started, which may be what does not read.
             let _ = kill_process_group(Pid::from_child(&self.child), Signal::KILL);
+            if !self.is_over() {
+                // Nothing that is left can be ended from here; nobody waits for it.
+                return;
+            }
         }
         let _ = self.child.wait();
         if let Some(writer) = self.writer.take() {
-            // With the process gone nothing holds it up.
             let _ = writer.join();
         }
     }
@@ -305,6 +401,7 @@ struct Reader {
     line: Vec<u8>,
     lines: u64,
     armed: Arc<AtomicBool>,
+    latest: Latest,
     states: rtrb::Producer<Heard>,
     words: Words,
 }
@@ -361,10 +458,16 @@ impl Reader {
         read.is_ok_and(|n| n > 0)
     }
 
-    /// Before the servo is there a state is not news for long, but a fault is; a full ring is a servo that has died.
+    /// Before the servo is there only the newest state is news, but every fault is; a full ring is a servo that has died.
     fn tell(&mut self, heard: Heard) {
-        if self.armed.load(Ordering::SeqCst) || matches!(heard, Heard::Fault(_)) {
-            let _ = self.states.push(heard);
+        match heard {
+            Heard::State { at, state, .. } if !self.armed.load(Ordering::SeqCst) => {
+                let mut latest = self.latest.lock().unwrap_or_else(PoisonError::into_inner);
+                *latest = Some((at, state));
+            }
+            _ => {
+                let _ = self.states.push(heard);
+            }
         }
     }
 }

@@ -90,7 +90,7 @@ pub fn hello(line: &[u8]) -> Result<Hello, LineError> {
             found: hello.telemime_driver,
         });
     }
-    if !(hello.rate_hz >= 10.0 && hello.rate_hz <= 1000.0) {
+    if !(hello.rate_hz >= 10.0 && hello.rate_hz <= super::FASTEST_HZ) {
         return Err(LineError::Rate {
             value: hello.rate_hz,
         });
@@ -135,7 +135,7 @@ pub fn said(line: &[u8], dof: usize) -> Result<Said, LineError> {
     let state = ArmState {
         q: joints("q", &q)?,
         qd: joints("qd", &qd)?,
-        opening: opening.unwrap_or(1.0).clamp(0.0, 1.0),
+        opening: opening.map(|opening| opening.clamp(0.0, 1.0)),
     };
     Ok(Said::State(state, seq))
 }
@@ -148,7 +148,8 @@ struct Line<'a> {
     qd: &'a [f64],
     qdd: &'a [f64],
     tau: &'a [f64],
-    opening: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    opening: Option<f64>,
 }
 
 /// A setpoint as a line, with its end, for an arm with `dof` joints; into `line` in place of what that holds.

@@ -15,7 +15,7 @@ use telemime_sim::arm::{ArmModel, Dynamics, Joints, PlantReport};
 
 use crate::servo::{ArmFault, ArmState, Manipulator, Setpoint};
 
-/// Setpoints whose time is remembered: with a tick of 1 ms two seconds.
+/// Setpoints whose time is remembered: with a tick of 1 ms two seconds, the longest patience.
 const REMEMBERED: usize = 2048;
 
 /// A joint may be told to be this far beyond its range, rad or m: sensors are offset, and stops give.
@@ -27,8 +27,17 @@ const TOO_FAST: (f64, f64) = (1.5, 0.1);
 /// A joint may leap by this much beyond what its speed explains, rad or m.
 const LEAP: f64 = 0.05;
 
-/// How long an arm may be silent or behind, s.
+/// Most states a second that a driver may tell.
+pub const FASTEST_HZ: f64 = 1000.0;
+
+/// How long an arm may be silent or behind if nothing is said, s.
 pub const PATIENCE_S: f64 = 0.1;
+
+/// The shortest and the longest patience, s: behind by more than the longest, a setpoint's time is not remembered any more.
+const PATIENCES_S: (f64, f64) = (0.01, 2.0);
+
+/// A driver's period counts this often in its patience: a setpoint waits for up to one of them, its answer for another.
+const PERIODS: f64 = 3.0;
 
 /// What the driver said, from the thread that reads it.
 #[derive(Debug, Clone, Copy)]
@@ -66,6 +75,54 @@ pub struct DriverConfig {
     pub patience_s: f64,
 }
 
+/// Why a driver cannot be waited for in that way.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum PatienceError {
+    /// No patience that anybody should have.
+    #[error("--driver-patience is {given_s} s: write one from 10ms to 2s")]
+    Range {
+        /// What was asked for, s.
+        given_s: f64,
+    },
+    /// The driver speaks too rarely for it.
+    #[error(
+        "--driver-patience is {given_s} s, and the driver tells its state {rate_hz} times a second: give it three of its periods, {least_s:.3} s, or a higher rate_hz"
+    )]
+    Short {
+        /// What was asked for, s.
+        given_s: f64,
+        /// The driver's rate, 1/s.
+        rate_hz: f64,
+        /// The least that goes with it, s.
+        least_s: f64,
+    },
+}
+
+impl DriverConfig {
+    /// A driver that tells its state `rate_hz` times a second is waited for during `patience_s`.
+    ///
+    /// # Errors
+    /// [`PatienceError`].
+    pub fn new(rate_hz: f64, patience_s: f64) -> Result<Self, PatienceError> {
+        let given_s = patience_s;
+        if !(PATIENCES_S.0..=PATIENCES_S.1).contains(&given_s) {
+            return Err(PatienceError::Range { given_s });
+        }
+        let least_s = PERIODS / rate_hz;
+        if !(given_s >= least_s) {
+            return Err(PatienceError::Short {
+                given_s,
+                rate_hz,
+                least_s,
+            });
+        }
+        Ok(Self {
+            rate_hz,
+            patience_s,
+        })
+    }
+}
+
 /// The servo's end of a driver.
 pub struct DriverArm {
     arm: Arc<ArmModel>,
@@ -80,6 +137,8 @@ pub struct DriverArm {
     fault: Option<ArmFault>,
     seq: u64,
     obeyed: u64,
+    /// The opening that the gripper was sent last, or told to have at the start.
+    told: Option<f64>,
     /// When the newest setpoints were made, and their positions.
     made: Box<[(Mono, Joints); REMEMBERED]>,
 }
@@ -100,6 +159,7 @@ impl DriverArm {
             heard,
             setpoints,
             made: Box::new([(Mono(0), state.q); REMEMBERED]),
+            told: state.opening,
             state,
             heard_at: None,
             began: None,
@@ -137,8 +197,7 @@ impl DriverArm {
         let (1.., Some(heard_at)) = (self.seq, self.heard_at) else {
             return Ok(());
         };
-        // A setpoint that was never made is none that could be obeyed.
-        let obeyed = self.obeyed.min(self.seq);
+        let obeyed = self.obeyed;
         let waiting = self.seq - obeyed;
         if waiting > 0 {
             let since = if waiting as usize >= REMEMBERED {
@@ -169,8 +228,18 @@ impl Manipulator for DriverArm {
             let found = match heard {
                 _ if self.fault.is_some() => continue,
                 Heard::Fault(fault) => Err(fault),
-                Heard::State { at, state, obeyed } => {
+                Heard::State { obeyed, .. } if obeyed > self.seq => Err(ArmFault::Unmade {
+                    seq: obeyed,
+                    newest: self.seq,
+                }),
+                Heard::State {
+                    at,
+                    mut state,
+                    obeyed,
+                } => {
                     let since_s = self.heard_at.map(|last| at.secs_since(last));
+                    // A gripper that tells nothing is where it was sent.
+                    state.opening = state.opening.or(self.told);
                     self.judge(&state, since_s).map(|()| {
                         (self.state, self.heard_at) = (state, Some(at));
                         self.obeyed = obeyed;
@@ -201,11 +270,9 @@ impl Manipulator for DriverArm {
         let most = self.arm.per_joint(|joint| joint.effort);
         let tau = carried + self.arm.friction(&reference.qd);
         let tau = tau.zip_map(&most, |tau, most| tau.clamp(-most, most));
-        let opening = if setpoint.opening.is_finite() {
-            setpoint.opening.clamp(0.0, 1.0)
-        } else {
-            self.state.opening
-        };
+        if let Some(opening) = setpoint.opening.filter(|opening| opening.is_finite()) {
+            self.told = Some(opening.clamp(0.0, 1.0));
+        }
         // A full ring is a driver that does not read: it is told from the setpoint it obeys.
         let _ = self.setpoints.push(Sent {
             seq: self.seq,
@@ -213,7 +280,7 @@ impl Manipulator for DriverArm {
             setpoint: Setpoint {
                 reference: *reference,
                 tau,
-                opening,
+                opening: self.told,
             },
         });
         (PlantReport::default(), self.state)

@@ -6,6 +6,8 @@ use super::*;
 use crate::control::JointReference;
 use crate::rig::{Rig, RigOptions};
 
+mod gripper;
+
 const MS: i64 = 1_000_000;
 
 struct Bench {
@@ -27,6 +29,7 @@ impl Bench {
         };
         let state = ArmState {
             q: rig.home,
+            opening: Some(0.5),
             ..ArmState::default()
         };
         Self {
@@ -42,7 +45,7 @@ impl Bench {
         let state = ArmState {
             q,
             qd,
-            opening: 0.5,
+            opening: Some(0.5),
         };
         let at = self.now;
         self.says.push(Heard::State { at, state, obeyed }).unwrap();
@@ -58,7 +61,7 @@ impl Bench {
                 ..JointReference::default()
             },
             tau: Joints::zeros(),
-            opening: f64::NAN,
+            opening: Some(f64::NAN),
         };
         self.arm.act(self.now, &setpoint, 1e-3);
         sensed
@@ -86,11 +89,12 @@ fn a_driver_that_does_what_it_must_is_none_to_complain_of() {
     let mut bench = Bench::new();
     assert_eq!(bench.obeys(1000, 20), None);
     let (state, _) = bench.tick(bench.home);
-    assert_eq!((state.q, state.opening), (bench.home, 0.5));
+    assert_eq!((state.q, state.opening), (bench.home, Some(0.5)));
     let sent = bench.hears.pop().unwrap();
     assert_eq!(
-        sent.setpoint.opening, 0.5,
-        "where it is, for what is no opening"
+        sent.setpoint.opening,
+        Some(0.5),
+        "where it was, for what is no opening"
     );
     // At rest the torque that goes with a setpoint is what carries the arm.
     let rig = Rig::load(&RigOptions::default()).unwrap();
@@ -141,6 +145,64 @@ fn a_driver_that_is_behind_its_setpoints_lags() {
     assert!(
         matches!(first, Some((_, ArmFault::Lagging { .. }))),
         "{first:?}"
+    );
+}
+
+#[test]
+fn a_setpoint_that_was_never_made_is_not_obeyed() {
+    let mut bench = Bench::new();
+    assert_eq!(bench.obeys(50, 0), None, "its own newest is");
+    let (home, newest) = (bench.home, bench.arm.seq);
+    bench.says(home, Joints::zeros(), newest + 1);
+    let unmade = ArmFault::Unmade {
+        seq: newest + 1,
+        newest,
+    };
+    assert_eq!(bench.tick(home).1, Some(unmade));
+}
+
+#[test]
+fn a_driver_is_waited_for_during_three_periods_at_least_and_two_seconds_at_most() {
+    let refused = |rate_hz, patience_s| DriverConfig::new(rate_hz, patience_s).unwrap_err();
+    for patience_s in [0.009, 2.001, 10.0, f64::NAN] {
+        let error = refused(1000.0, patience_s);
+        assert!(matches!(error, PatienceError::Range { .. }), "{error}");
+    }
+    let PatienceError::Short { least_s, .. } = refused(10.0, PATIENCE_S) else {
+        panic!("a period of 100 ms");
+    };
+    assert_eq!(least_s, 0.3);
+    for rate_hz in [10.0, 25.0, 30.0, 250.0, 1000.0] {
+        // The shortest that is allowed is enough for states a period apart, each a tick late, that answer the setpoint of two periods ago.
+        let patience_s = (3.0_f64 / rate_hz).max(PATIENCES_S.0);
+        let config = DriverConfig::new(rate_hz, patience_s).unwrap();
+        let mut bench = Bench::new();
+        bench.arm.config = config;
+        let period = (1000.0 / rate_hz) as u64;
+        for n in 0..20 * period {
+            if n % period == n / period % 2 {
+                let (home, seq) = (bench.home, bench.arm.seq.saturating_sub(2 * period - 1));
+                bench.says(home, Joints::zeros(), seq);
+            }
+            let home = bench.home;
+            assert_eq!(bench.tick(home).1, None, "{rate_hz} Hz, tick {n}");
+        }
+    }
+    // And the longest is remembered to its end.
+    let mut bench = Bench::new();
+    bench.arm.config = DriverConfig::new(500.0, PATIENCES_S.1).unwrap();
+    assert_eq!(bench.obeys(5000, 1990), None);
+    let mut bench = Bench::new();
+    bench.arm.config = DriverConfig::new(500.0, PATIENCES_S.1).unwrap();
+    let (_, fault) = bench.obeys(5000, 2010).unwrap();
+    assert!(
+        matches!(
+            fault,
+            ArmFault::Lagging {
+                behind_ms: 2001..=2012
+            }
+        ),
+        "{fault}"
     );
 }
 
@@ -210,6 +272,7 @@ fn an_arm_that_stays_behind_where_it_is_told_to_be_is_astray() {
 fn a_driver_that_does_not_read_costs_the_tick_nothing_and_is_found_out() {
     let mut bench = Bench::new();
     let home = bench.home;
+    bench.tick(home);
     for _ in 0..400 {
         bench.says(home, Joints::zeros(), 1);
         let (_, fault) = bench.tick(home);
@@ -238,7 +301,7 @@ fn lines_are_understood_or_refused_with_the_reason() {
     let Ok(Said::State(state, 7)) = line::said(br#"{"q":[1,2],"qd":[0.5,0],"seq":7}"#, 2) else {
         panic!("a state");
     };
-    assert_eq!((state.q[1], state.qd[0], state.opening), (2.0, 0.5, 1.0));
+    assert_eq!((state.q[1], state.qd[0], state.opening), (2.0, 0.5, None));
     assert!(matches!(
         line::said(br#"{"fault":"too warm"}"#, 2),
         Ok(Said::Fault(text)) if text == "too warm"
@@ -272,7 +335,7 @@ fn a_setpoint_is_one_line_of_json_that_reads_back_to_the_bit() {
                 ..JointReference::default()
             },
             tau: q * 2.0,
-            opening: 0.25,
+            opening: Some(0.25),
         },
     };
     let mut text = vec![b'x'; 10];

@@ -13,8 +13,8 @@ pub struct ArmState {
     pub q: Joints,
     /// Joint velocities, rad/s or m/s.
     pub qd: Joints,
-    /// How far the gripper is open: 0 is closed, 1 is open.
-    pub opening: f64,
+    /// How far the gripper is open, 0 closed to 1 open; `None` while nobody knows.
+    pub opening: Option<f64>,
 }
 
 /// What a tick asks of the arm.
@@ -24,8 +24,8 @@ pub struct Setpoint {
     pub reference: JointReference,
     /// Torques that close the loop at the measured joints, N·m or N: for an arm that is driven by torque.
     pub tau: Joints,
-    /// How far the gripper is to be open, from 0 to 1; may be any number.
-    pub opening: f64,
+    /// How far the gripper is to be open, 0 to 1, and beyond that as if it were the end; `None` asks nothing of it.
+    pub opening: Option<f64>,
 }
 
 /// Why an arm is not to be driven any more. Joints are counted from 0.
@@ -79,6 +79,16 @@ pub enum ArmFault {
         /// By how much, ms.
         behind_ms: u32,
     },
+    /// The driver obeys a setpoint that it was never given.
+    #[error(
+        "the driver says that it obeys setpoint {seq}, and the newest is {newest}: `seq` is that of the setpoint it obeys"
+    )]
+    Unmade {
+        /// Its number.
+        seq: u64,
+        /// The newest there is.
+        newest: u64,
+    },
     /// A joint is not where its setpoints are.
     #[error("joint {joint} does not follow: it is {by:.4} from its setpoint")]
     Astray {
@@ -115,7 +125,7 @@ impl SimulatedArm {
         ArmState {
             q: *self.plant.q(),
             qd: *self.plant.qd(),
-            opening: self.gripper.opening(),
+            opening: Some(self.gripper.opening()),
         }
     }
 }
@@ -127,7 +137,9 @@ impl Manipulator for SimulatedArm {
 
     fn act(&mut self, _now: Mono, setpoint: &Setpoint, dt_s: f64) -> (PlantReport, ArmState) {
         let strain = self.plant.step(&setpoint.tau, dt_s);
-        self.gripper.step(setpoint.opening, dt_s);
+        if let Some(opening) = setpoint.opening {
+            self.gripper.step(opening, dt_s);
+        }
         (strain, self.state())
     }
 }

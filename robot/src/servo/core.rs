@@ -48,8 +48,9 @@ pub struct CoreConfig {
     pub lag_s: f64,
     /// Where the tip may be.
     pub workspace: Workspace,
-    /// An engage begins at the setpoint that the arm holds, not at its measured joints: an arm that sags under its own weight would be
-    /// told to sag more.
+    /// What is held is the setpoint, not what was measured. An engage begins at the setpoint that the arm holds: one that sags under its own weight
+    /// would be told to sag more. And a gripper keeps the opening it was sent last: at what it grips it has stopped earlier, and told to stay
+    /// there it would let go.
     pub from_setpoint: bool,
 }
 
@@ -92,8 +93,8 @@ struct State {
     orientation_error_rad: f64,
     /// Where the tip was last asked to be turned to.
     turned_to: Option<UnitQuaternion<f64>>,
-    /// The opening that the gripper is to go to.
-    opening: f64,
+    /// The opening that the gripper is to go to, if any has been asked for or told.
+    opening: Option<f64>,
     target_m: Vector3<f64>,
     reference_m: Vector3<f64>,
     acceleration: Vector3<f64>,
@@ -151,11 +152,11 @@ pub struct Core {
 }
 
 impl Core {
-    /// A servo at rest, before an arm whose gripper is open as far as `opening`.
+    /// A servo at rest, before an arm whose gripper is open as far as `opening`, if that is known.
     pub fn new(
         config: CoreConfig,
         controller: Controller,
-        opening: f64,
+        opening: Option<f64>,
         spent: rtrb::Producer<Arc<Trajectory>>,
     ) -> Self {
         let tip_m = controller.reference().p;
@@ -420,7 +421,9 @@ impl Core {
     fn demand(&mut self, now: Mono, arm: &ArmState) -> Demand {
         self.state.out_of_reach = false;
         // When the motion ends, the gripper stays as it is.
-        self.state.opening = arm.opening;
+        if !self.config.from_setpoint {
+            self.state.opening = arm.opening;
+        }
         if !self.state.safety.is_following() {
             return Demand::Stop;
         }
@@ -479,7 +482,9 @@ impl Core {
         }
         if let Some(grip) = grip {
             self.state.out_of_reach |= !grip.is_finite();
-            self.state.opening = grip;
+            if grip.is_finite() {
+                self.state.opening = Some(grip);
+            }
         }
         Demand::Follow {
             target: self.state.target_m,

@@ -213,7 +213,7 @@ pub struct Report {
     /// The angle from there to the orientation asked for, or to the one being kept, rad.
     pub orientation_error_rad: f64,
     /// How far the gripper is open: 0 is closed, 1 is open.
-    pub opening: f64,
+    pub opening: Option<f64>,
     /// Joint positions.
     pub q: Joints,
     /// What is wrong with the arm, or with what drives it.

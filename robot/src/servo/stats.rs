@@ -7,7 +7,7 @@ const BUCKETS: usize = 29 * PER_OCTAVE;
 /// Tick times in logarithmic buckets from a nanosecond to four seconds.
 #[derive(Debug, Clone)]
 pub struct TickStats {
-    buckets: [u32; BUCKETS],
+    buckets: [u64; BUCKETS],
     count: u64,
     sum_ns: u64,
     max_ns: u32,
@@ -91,7 +91,7 @@ impl TickStats {
         let rank = (p * self.count as f64).ceil() as u64;
         let mut seen = 0;
         for (i, &n) in self.buckets.iter().enumerate() {
-            seen += u64::from(n);
+            seen += n;
             if seen >= rank && seen > 0 {
                 return upper_edge_ns(i);
             }
@@ -133,5 +133,16 @@ mod tests {
             (9_000_000, 9_000_000, stats.quantile_ns(0.99))
         );
         assert_eq!(stats.mean_ns(), (98 * 5_100 + 40_000 + 9_000_000) / 100);
+    }
+
+    #[test]
+    fn months_of_ticks_are_counted() {
+        let mut stats = TickStats::default();
+        // 50 days of ticks of the same length.
+        stats.buckets[bucket(5_100)] = u64::from(u32::MAX);
+        stats.count = u64::from(u32::MAX);
+        (0..10).for_each(|_| stats.add(5_100));
+        assert_eq!(stats.quantile_ns(0.5), upper_edge_ns(bucket(5_100)));
+        assert_eq!(stats.count(), u64::from(u32::MAX) + 10);
     }
 }

@@ -29,8 +29,9 @@ use telemime_protocol::wire::v1::{
 use telemime_protocol::wire::{DecodeError, Version, Versions};
 
 use crate::clock::{SessionClock, Slew};
+use crate::safety::SafetyConfig;
 use crate::servo::thread::Times;
-use crate::servo::{self, Engagement, Lease, Order, Report, Source, Ticket, Trajectory};
+use crate::servo::{self, Engagement, Order, Report, Source, Ticket, Trajectory};
 use motion::Mirror;
 
 /// Pings in quick succession at the start, so that the clock is known before the first engage.
@@ -51,6 +52,8 @@ pub struct SessionConfig {
     pub telemetry_s: f64,
     /// A sample that took longer than this to arrive authorises nothing beyond, s.
     pub max_delay_s: f64,
+    /// The longest time that a message authorises motion for, s; what is late is taken off this.
+    pub max_lease_s: f64,
     /// The protocol versions this robot speaks.
     pub versions: Versions,
 }
@@ -60,6 +63,7 @@ impl Default for SessionConfig {
         Self {
             telemetry_s: 0.05,
             max_delay_s: 0.5,
+            max_lease_s: SafetyConfig::default().max_lease_s,
             versions: Versions::default(),
         }
     }
@@ -121,7 +125,7 @@ pub struct Session {
     engagement: u32,
     acknowledged: u32,
     newest_seq: u32,
-    delay_s: f64,
+    delay_s: Option<f64>,
     dropped: u32,
     tally: Tally,
     reception: Reception,
@@ -136,6 +140,8 @@ pub struct Session {
     next_ping: Mono,
     next_telemetry: Mono,
     outputs: VecDeque<Output>,
+    /// The servo has not been told of this operator: the order was lost.
+    owed: bool,
 }
 
 impl Session {
@@ -161,7 +167,7 @@ impl Session {
             engagement: 0,
             acknowledged: 0,
             newest_seq: 0,
-            delay_s: 0.0,
+            delay_s: None,
             dropped: 0,
             tally: Tally::default(),
             reception: Reception::default(),
@@ -176,6 +182,7 @@ impl Session {
             next_ping: now,
             next_telemetry: now,
             outputs: VecDeque::new(),
+            owed: false,
             info,
         };
         session.send(&RobotControl::Info(session.info.clone()));
@@ -383,6 +390,9 @@ impl Session {
         let changed = self.transitions != Some(report.transitions);
         self.transitions = Some(report.transitions);
         self.report = Some(*report);
+        if std::mem::take(&mut self.owed) {
+            self.order(Order::Operator(true));
+        }
         let follows = matches!(report.state, RobotState::Engaged | RobotState::Coasting);
         if follows && self.mirror.is_some() {
             self.ages.add(report.age_s);
@@ -449,6 +459,20 @@ impl Session {
     /// The connection ended: the operator has no authority any more.
     pub fn handle_closed(&mut self) {
         self.order(Order::Operator(false));
+    }
+
+    /// An order that [`poll_output`](Self::poll_output) gave found no place on its way to the servo, and the brake was pulled for it.
+    pub fn handle_lost(&mut self, order: &Order) {
+        match order {
+            // It is nowhere: no report will ever acknowledge or decline it.
+            Order::Engage(engagement) if engagement.ticket == self.ticket() => {
+                self.acknowledged = self.engagement;
+                self.mirror = None;
+                self.refuse(Refusal::Moving);
+            }
+            Order::Operator(true) => self.owed = true,
+            _ => {}
+        }
     }
 
     /// What to do next.
@@ -570,10 +594,7 @@ impl Session {
             source,
             scale: f64::from(engage.scale),
             rotation,
-            lease: Lease {
-                from: now,
-                until: now.offset_by_secs(f64::from(engage.lease_ms) * 1e-3 - late_s),
-            },
+            lease: self.lease(now, engage.lease_ms, late_s),
         }));
         Ok(())
     }
@@ -648,7 +669,8 @@ impl Session {
             t_us: self.clock.to_session(report.at).map_or(0, |t| t.0 / 1000),
             clock_uncertainty_us: uncertainty_us as u32,
             age_ms: milliseconds(report.age_s),
-            delay_ms: milliseconds(self.delay_s),
+            // 0 is for what is not known: a delay that cannot be told from none is the least there is.
+            delay_ms: self.delay_s.map_or(0, |s| milliseconds(s).max(1)),
             path_frontier: self.mirror.as_ref().map_or(0, Mirror::frontier),
             received: self.reception.received(),
             newest_seq: self.reception.newest(),
@@ -656,7 +678,7 @@ impl Session {
             clamps: report.clamps,
             tip_m: report.tip_m.cast::<f32>().into(),
             tip_q: WireRotation::quantise(&report.orientation),
-            grip: Some(quantise_grip(report.opening)),
+            grip: report.opening.map(quantise_grip),
             q: report
                 .q
                 .iter()

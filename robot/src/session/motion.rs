@@ -56,12 +56,12 @@ impl Session {
             return fresh;
         }
         mirror.newest_t = state.t;
-        let lease = Self::lease(self.config.max_delay_s, now, motion.lease_ms, age_s);
+        let diverged = mirror.diverged;
+        let lease = self.lease(now, motion.lease_ms, self.too_late_s(age_s));
         if lease.until <= now {
             return false;
         }
-        self.delay_s = age_s;
-        let diverged = mirror.diverged;
+        self.delay_s = Some(age_s);
         let model = if diverged { 0 } else { motion.model };
         let mut forecast = self.forecast(&state, model, &motion.params.dequantise());
         let mut turn = self.turn_forecast(state.t, model, motion.pose.turn.as_ref());
@@ -106,7 +106,7 @@ impl Session {
         if age_s < -self.config.max_delay_s {
             return false;
         }
-        let lease = Self::lease(self.config.max_delay_s, now, lease_ms, age_s);
+        let lease = self.lease(now, lease_ms, self.too_late_s(age_s));
         if lease.until <= now {
             return false;
         }
@@ -114,7 +114,7 @@ impl Session {
             return false;
         };
         self.newest_seq = seq;
-        self.delay_s = age_s;
+        self.delay_s = Some(age_s);
         let ticket = self.ticket();
         self.order(Order::Extend {
             ticket,
@@ -143,12 +143,17 @@ impl Session {
         })
     }
 
-    /// Counted from the arrival, or from when the message should have arrived at the latest.
-    fn lease(max_delay_s: f64, now: Mono, lease_ms: u16, age_s: f64) -> Lease {
-        let too_late_s = (age_s - max_delay_s).max(0.0);
+    /// By how much more than is allowed a message that is `age_s` old is late, s.
+    fn too_late_s(&self, age_s: f64) -> f64 {
+        (age_s - self.config.max_delay_s).max(0.0)
+    }
+
+    /// What a message that arrives `now`, and says `lease_ms`, authorises if it is `late_s` late: less than the longest lease by that, whatever it says.
+    pub(super) fn lease(&self, now: Mono, lease_ms: u16, late_s: f64) -> Lease {
+        let said_s = f64::from(lease_ms) * 1e-3;
         Lease {
             from: now,
-            until: now.offset_by_secs(f64::from(lease_ms) * 1e-3 - too_late_s),
+            until: now.offset_by_secs(said_s.min(self.config.max_lease_s) - late_s),
         }
     }
 

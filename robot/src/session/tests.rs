@@ -81,7 +81,7 @@ fn report(state: RobotState) -> Report {
         orientation: UnitQuaternion::identity(),
         orientation_error_rad: 0.0,
         plan_s: None,
-        opening: 1.0,
+        opening: Some(1.0),
         q: Joints::zeros(),
         clamps: 0,
         fault: None,

@@ -1,8 +1,9 @@
-//! A synthetic operator: a person who waves an arm in front of a depth sensor, or reaches for something, never twice alike; and a hand that pushes aside what is played.
+//! A synthetic operator: a person who waves an arm in front of a depth sensor, or reaches for something, never twice alike; a hand that pushes aside what is played, and what a depth camera sees of it.
 //!
 //! Written to be as fast and as varied as public Kinect recordings of waving (95 % of speeds below 4 to 5 m/s on average, half-swings of about 0.3 s that
 //! differ in width, time and course), so that what is learned and predicted from it behaves as on those.
 
+mod depth;
 mod push;
 mod reach;
 mod tap;
@@ -14,6 +15,7 @@ use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use rand_xoshiro::Xoshiro256PlusPlus;
 
+pub use depth::Scene;
 pub use push::push;
 pub use reach::{carry, reach};
 pub use tap::taps;

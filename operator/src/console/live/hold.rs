@@ -7,7 +7,9 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Refusal, RobotState};
 
 use super::{Known, Live};
+use crate::clutch::{Clutch, Phase};
 use crate::console::Holding;
+use crate::dating::Dating;
 use crate::demonstration::{Demonstration, Sample};
 use crate::lessons::{Lesson, LessonError};
 use crate::session::{HandSample, Session};
@@ -15,49 +17,20 @@ use crate::session::{HandSample, Session};
 /// A sample is never dated back by more than this, s.
 const OLDEST_S: f64 = 0.1;
 
-/// Pause before a declined request is made again, s, and how often.
-const RETRY_S: f64 = 0.05;
-
-const RETRIES: u32 = 40;
-
 /// Strokes that are kept.
 const MOST_STROKES: usize = 50;
 
 /// Longest stroke, samples: two minutes at 125 a second.
 const LONGEST_STROKE: usize = 15_000;
 
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Phase {
-    /// To be asked again then.
-    Again(Stamp),
-    Asked,
-    Following,
-    /// Nothing is asked of the robot.
-    Apart,
-}
-
 #[derive(Debug)]
 pub(super) struct Hold {
     pub(super) page: u64,
     pub(super) what: Holding,
-    pub(super) phase: Phase,
-    pub(super) tries: u32,
+    pub(super) clutch: Clutch,
     pub(super) heard: Stamp,
-    /// The session clock less the page's at the fastest message so far, s.
-    pub(super) ahead_s: f64,
+    dating: Dating,
     pub(super) newest: Option<(Stamp, Vector3<f64>)>,
-}
-
-impl Hold {
-    /// When a sample of the page's time `t_ms` was valid: jitter of the browser is taken out of it.
-    pub(super) fn dated(&mut self, now: Stamp, t_ms: f64) -> Stamp {
-        let page_s = t_ms * 1e-3;
-        let ahead_s = now.0 as f64 * 1e-9 - page_s;
-        // A page's clock may drift: what was fastest once is not for ever.
-        self.ahead_s = ahead_s.min(self.ahead_s + 1e-4);
-        let late_s = (ahead_s - self.ahead_s).clamp(0.0, OLDEST_S);
-        now.offset_by_secs(-late_s)
-    }
 }
 
 impl Live {
@@ -86,10 +59,9 @@ impl Live {
         self.hold = Some(Hold {
             page,
             what,
-            phase: Phase::Apart,
-            tries: 0,
+            clutch: Clutch::pressed(),
             heard: now,
-            ahead_s: f64::INFINITY,
+            dating: Dating::new(OLDEST_S),
             newest: None,
         });
         match what {
@@ -122,20 +94,13 @@ impl Live {
 
     pub(super) fn phase(&mut self, phase: Phase) {
         if let Some(hold) = &mut self.hold {
-            hold.phase = phase;
+            hold.clutch.phase = phase;
         }
     }
 
     pub(super) fn ask(&mut self, now: Stamp, session: &mut Session) {
         if let Some(hold) = &mut self.hold {
-            hold.tries += 1;
-            // A skill that was just learned is still on its way.
-            if !session.is_ready() && hold.tries < RETRIES {
-                hold.phase = Phase::Again(now.offset_by_secs(RETRY_S));
-                return;
-            }
-            hold.phase = Phase::Asked;
-            session.engage(now);
+            hold.clutch.ask(now, session);
         }
     }
 
@@ -150,7 +115,7 @@ impl Live {
             return;
         };
         hold.heard = now;
-        let t = hold.dated(now, t_ms);
+        let t = hold.dating.dated(now, t_ms * 1e-3);
         if hold.what == Holding::Play || hold.newest.is_some_and(|(last, _)| t <= last) {
             return;
         }
@@ -208,14 +173,10 @@ impl Live {
     }
 
     pub(super) fn declined(&mut self, now: Stamp, reason: Refusal) {
-        let passes = matches!(
-            reason,
-            Refusal::ClockUnknown | Refusal::Moving | Refusal::StaleReference
-        );
-        match &mut self.hold {
-            Some(hold) if passes && hold.what == Holding::Hand && hold.tries < RETRIES => {
-                hold.phase = Phase::Again(now.offset_by_secs(RETRY_S));
-            }
+        let asked = |hold: &&mut Hold| hold.what == Holding::Hand;
+        let hold = self.hold.as_mut().filter(asked);
+        match hold.map(|hold| hold.clutch.declined(now, reason)) {
+            Some(true) => {}
             _ if reason == Refusal::Diverged => {}
             _ => {
                 self.drop_hold();

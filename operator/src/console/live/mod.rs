@@ -17,10 +17,11 @@ use telemime_protocol::wire::arm::WireArm;
 use telemime_protocol::wire::v1::{Cause, RobotState, Telemetry};
 use tokio::sync::{mpsc, watch};
 
-use hold::{Hold, Phase};
+use hold::Hold;
 
 use super::snapshot::Seen;
 use super::{Command, Holding, Shape, Snapshot};
+use crate::clutch::Phase;
 use crate::demonstration::{Demonstration, Sample};
 use crate::recognise::{Recogniser, Verdict};
 use crate::session::{Event, Session};
@@ -328,7 +329,7 @@ impl Live {
                 let follows = self
                     .hold
                     .as_ref()
-                    .is_some_and(|hold| hold.phase == Phase::Following);
+                    .is_some_and(|hold| hold.clutch.phase == Phase::Following);
                 match state {
                     RobotState::Stopped => self.drop_hold(),
                     // What has not been granted yet the robot cannot have let go of.
@@ -388,10 +389,9 @@ impl Live {
                 self.note("the page that drove fell silent: the clutch is let go");
                 self.let_go(Some(session));
             }
-            Some(Hold {
-                phase: Phase::Again(at),
-                ..
-            }) if now >= *at => self.ask(now, session),
+            Some(hold) if hold.clutch.again().is_some_and(|at| now >= at) => {
+                self.ask(now, session);
+            }
             _ => {}
         }
         // Whatever took the clutch out of the hand: what nobody holds is not driven.
@@ -411,10 +411,7 @@ impl Live {
             .hold
             .as_ref()
             .map(|hold| hold.heard.offset_by_secs(LEASE_S));
-        let again = self.hold.as_ref().and_then(|hold| match hold.phase {
-            Phase::Again(at) => Some(at),
-            _ => None,
-        });
+        let again = self.hold.as_ref().and_then(|hold| hold.clutch.again());
         // The server keeps one receiver; the others are pages that look.
         let snapshot = (self.shown.receiver_count() > 1).then_some(self.next);
         [lease, again, snapshot].into_iter().flatten().min()

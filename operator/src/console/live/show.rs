@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 use telemime_protocol::time::Stamp;
 
 use super::Live;
-use super::hold::Phase;
+use crate::clutch::Phase;
 use crate::console::Holding;
 use crate::console::snapshot::{Arm, HandShown, Robot, Sent, Snapshot};
 use crate::demonstration::Demonstration;
@@ -38,7 +38,7 @@ impl Live {
         let following = self
             .hold
             .as_ref()
-            .filter(|hold| hold.phase == Phase::Following);
+            .filter(|hold| hold.clutch.phase == Phase::Following);
         let told = following.and_then(|_| session?.told());
         let path = told.map_or_else(Vec::new, |told| {
             let from_s = now.secs_since(told.t);

@@ -56,7 +56,15 @@ pub enum RecordError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said, or the library.
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The format has no room for it.
+    #[error("{}: {source}; the recording ends here, and what was written before is whole", path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What the library said.
         source: mcap::McapError,
     },
     /// The system gives no thread.
@@ -69,7 +77,7 @@ pub enum RecordError {
 pub struct Outcome {
     /// It.
     pub path: PathBuf,
-    /// Messages in it.
+    /// Messages in it, as far as it is whole.
     pub messages: u64,
     /// Entries that were lost since the beginning because the disk was too slow.
     pub dropped: u64,

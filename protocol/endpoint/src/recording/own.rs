@@ -147,8 +147,9 @@ pub struct RobotState {
     pub jerk_m_s3: f64,
     /// From the orientation to the one asked for, or the one being kept, rad.
     pub orientation_error_rad: f64,
-    /// How far the gripper is open, 0 to 1.
-    pub opening: f64,
+    /// How far the gripper is open, 0 to 1, if that is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub opening: Option<f64>,
     /// What is wrong with the arm.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fault: Option<String>,

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufReader, ErrorKind, Read};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
 use mcap::McapError;
@@ -39,6 +40,12 @@ pub enum ReadError {
         path: PathBuf,
         /// How.
         how: String,
+    },
+    /// Its lengths contradict each other.
+    #[error("{}: the lengths that stand in this file cannot be; record it again", path.display())]
+    Forged {
+        /// The file.
+        path: PathBuf,
     },
     /// The system or the library has trouble in the middle.
     #[error("{}: after {messages} messages: {source}; `mcap recover` may save more", path.display())]
@@ -88,14 +95,25 @@ struct Channel {
 ///
 /// # Errors
 /// [`ReadError`]; a file that is only cut off is none.
-pub fn read(path: &Path, mut each: impl FnMut(Message<'_>)) -> Result<Contents, ReadError> {
+pub fn read(path: &Path, each: impl FnMut(Message<'_>)) -> Result<Contents, ReadError> {
+    // The library subtracts lengths that a forged file states; where overflow is checked, that is a panic.
+    let read = AssertUnwindSafe(|| read_records(path, each));
+    catch_unwind(read).unwrap_or_else(|_| {
+        Err(ReadError::Forged {
+            path: path.to_owned(),
+        })
+    })
+}
+
+fn read_records(path: &Path, mut each: impl FnMut(Message<'_>)) -> Result<Contents, ReadError> {
     let io = |source| ReadError::Io {
         path: path.to_owned(),
         source,
     };
     let mut file = BufReader::new(File::open(path).map_err(io)?);
     let options = LinearReaderOptions::default()
-        .with_validate_chunk_crcs(true)
+        // With the limit this bounds what a chunk may claim, and a damaged one is not looked into.
+        .with_prevalidate_chunk_crcs(true)
         .with_record_length_limit(MAX_RECORD);
     let mut reader = LinearReader::new_with_options(options);
     let mut contents = Contents::default();

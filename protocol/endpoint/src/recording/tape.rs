@@ -66,6 +66,8 @@ pub struct Tape {
     flushed: Option<Stamp>,
     unflushed: bool,
     messages: u64,
+    /// Of those, in the part of the file that is whole.
+    whole: u64,
     dropped: u64,
     ended: Option<Outcome>,
     buffer: Vec<u8>,
@@ -87,6 +89,7 @@ impl Tape {
             flushed: None,
             unflushed: false,
             messages: 0,
+            whole: 0,
             dropped: 0,
             ended: None,
             buffer: Vec::new(),
@@ -96,7 +99,7 @@ impl Tape {
     /// Writes `message` under `topic`.
     ///
     /// # Errors
-    /// [`RecordError::Write`].
+    /// [`RecordError::Write`], [`RecordError::Format`].
     pub fn message<T: Encode>(
         &mut self,
         topic: &'static str,
@@ -140,7 +143,7 @@ impl Tape {
         };
         (self.path, self.open) = (path, Some(open));
         (self.newest, self.flushed, self.unflushed) = (Stamp::ZERO, None, false);
-        self.messages = 0;
+        (self.messages, self.whole) = (0, 0);
         Ok(())
     }
 
@@ -174,7 +177,10 @@ impl Tape {
             return Ok(());
         };
         (self.flushed, self.unflushed) = (Some(self.newest), false);
-        open.flush().map_err(|source| self.failed(source))
+        let done = open.flush();
+        done.map_err(|source| self.failed(source))?;
+        self.whole = self.messages;
+        Ok(())
     }
 
     /// Ends the file; with an `error`, where it last was whole.
@@ -195,17 +201,26 @@ impl Tape {
         };
         Outcome {
             path: self.path.clone(),
-            messages: self.messages,
+            messages: if error.is_some() {
+                self.whole
+            } else {
+                self.messages
+            },
             dropped: self.dropped,
             error,
         }
     }
 
     fn failed(&self, source: McapError) -> RecordError {
-        RecordError::Write {
-            path: self.path.clone(),
-            source,
-        }
+        failed(&self.path, source)
+    }
+}
+
+fn failed(path: &Path, source: McapError) -> RecordError {
+    let path = path.to_owned();
+    match source {
+        McapError::Io(source) => RecordError::Write { path, source },
+        source => RecordError::Format { path, source },
     }
 }
 
@@ -247,10 +262,7 @@ fn begin(path: &Path, about: &BTreeMap<String, String>) -> Result<Open, RecordEr
     open.map_err(|source| {
         // A file of ours, and nothing in it.
         let _ = std::fs::remove_file(path);
-        RecordError::Write {
-            path: path.to_owned(),
-            source,
-        }
+        failed(path, source)
     })
 }
 

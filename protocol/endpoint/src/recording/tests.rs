@@ -171,6 +171,28 @@ fn a_file_that_is_cut_off_anywhere_gives_all_that_was_whole() {
     assert!(matches!(refused, ReadError::NotMcap { .. }), "{refused}");
 }
 
+/// Whoever hands over a file may have written anything into it.
+#[test]
+fn a_file_with_anything_changed_is_read_or_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.mcap");
+    record(&path, (0..40).map(|i| 1000 + 10 * i));
+    let whole = std::fs::read(&path).unwrap();
+    let (mut refused, mut seed) = (0, 7_u64);
+    for _ in 0..2000 {
+        let mut bytes = whole.clone();
+        for _ in 0..3 {
+            // A linear congruence does for places and values.
+            seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            let at = (seed >> 33) as usize % bytes.len();
+            bytes[at] = (seed >> 25) as u8;
+        }
+        std::fs::write(&path, &bytes).unwrap();
+        refused += u32::from(read(&path, |_| ()).is_err());
+    }
+    assert!((500..2000).contains(&refused), "{refused}");
+}
+
 #[test]
 fn a_message_of_ours_is_what_its_schema_says() {
     fn check<T: Own>(message: &T) {
@@ -232,7 +254,7 @@ fn a_message_of_ours_is_what_its_schema_says() {
         plan_s: Some(0.1),
         jerk_m_s3: 0.1,
         orientation_error_rad: 0.1,
-        opening: 0.5,
+        opening: Some(0.5),
         fault: Some("none".into()),
     });
 }

@@ -403,6 +403,45 @@ fn an_old_request_is_not_meant_any_more() {
 }
 
 #[test]
+fn a_request_that_finds_no_place_before_the_servo_is_refused_and_the_next_is_granted() {
+    let mut bench = Bench::ready(None);
+    let (first, second) = (bench.mirror(1), bench.mirror(2));
+    bench.engage(&first);
+    let lost = bench.orders.pop().unwrap();
+    bench.session.handle_lost(&lost);
+    bench.drain();
+    assert_eq!(bench.refusals(), [Refusal::Moving]);
+    // The servo knows nothing of it.
+    bench.report(&report(RobotState::Ready));
+    assert_eq!(bench.refusal(&second), None);
+    // What is lost of an engagement that is under way refuses nothing.
+    bench.reports(RobotState::Engaged);
+    let motion = Motion {
+        engagement: 2,
+        ..bench.motion(1, 20)
+    };
+    bench.forget();
+    bench.send(&motion);
+    let lost = bench.orders.pop().unwrap();
+    bench.session.handle_lost(&lost);
+    bench.drain();
+    assert_eq!(bench.refusals(), []);
+}
+
+#[test]
+fn a_servo_that_was_not_told_of_its_operator_is_told_again() {
+    let mut bench = Bench::fresh(None);
+    bench.session.handle_lost(&Order::Operator(true));
+    bench.forget();
+    for told in [1, 0] {
+        bench.orders.clear();
+        bench.report(&report(RobotState::Idle));
+        let present = |order: &&Order| matches!(order, Order::Operator(true));
+        assert_eq!(bench.orders.iter().filter(present).count(), told);
+    }
+}
+
+#[test]
 fn one_request_at_a_time() {
     let mut bench = Bench::ready(None);
     let (first, second) = (bench.mirror(1), bench.mirror(2));

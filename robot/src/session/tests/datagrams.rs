@@ -121,6 +121,50 @@ fn the_lease_shrinks_by_what_a_message_is_too_late() {
 }
 
 #[test]
+fn the_longest_lease_cannot_be_outbid_by_what_is_too_old() {
+    let mut bench = Bench::mirroring(None);
+    for (seq, ms_ago, leases) in [
+        (1, 60_000, &[][..]),
+        (2, 1600, &[]),
+        (3, 1400, &[100]),
+        (4, 20, &[1000]),
+    ] {
+        bench.forget();
+        let motion = Motion {
+            lease_ms: 65_000,
+            ..bench.motion(seq, ms_ago)
+        };
+        bench.send(&motion);
+        assert_eq!(bench.leases_ms(), leases, "{ms_ago} ms old");
+    }
+    assert_eq!(bench.dropped(), 2);
+}
+
+#[test]
+fn a_delay_that_is_less_than_a_millisecond_is_one_and_none_is_what_is_not_known() {
+    let mut bench = Bench::mirroring(None);
+    let delay_ms = |bench: &mut Bench| {
+        bench.forget();
+        bench.pass(50);
+        bench.session.handle_timeout(bench.now);
+        bench.drain();
+        let told = bench.datagrams.iter().find_map(|datagram| match datagram {
+            RobotDatagram::Telemetry(telemetry) => Some(telemetry.delay_ms),
+            _ => None,
+        });
+        told.unwrap()
+    };
+    assert_eq!(delay_ms(&mut bench), 0, "nothing has arrived");
+    // From the same moment, and from one a little ahead of the clock's estimate.
+    for (seq, ms_ago, told) in [(1, 0, 1), (2, -3, 1), (3, 7, 7)] {
+        bench.pass(50);
+        let motion = bench.motion(seq, ms_ago);
+        bench.send(&motion);
+        assert_eq!(delay_ms(&mut bench), told, "{ms_ago}");
+    }
+}
+
+#[test]
 fn only_a_newer_sample_is_followed() {
     let mut bench = Bench::mirroring(None);
     let older = bench.motion(1, 80);
