@@ -24,7 +24,8 @@ const STALL: Duration = Duration::from_secs(30);
 /// All that a viewer may say, bytes: thousands of subscriptions, and not what would fill the memory.
 const SAID: u64 = 1 << 20;
 
-/// What is under way to a viewer, bytes, in each of the sockets: a second's, so that one which is slow sees what is new.
+/// What is under way to a viewer, bytes, in each of the sockets (the system doubles it): about a second of a robot's, so
+/// that a viewer which is slow sees what is new.
 const UNDER_WAY: u32 = 64 * 1024;
 
 /// After an accept that failed the next one is tried this much later.

@@ -1,14 +1,16 @@
 //! Foxglove's server, and ours before it, on a thread of their own.
 
 use std::collections::BTreeMap;
+use std::io;
 use std::net::{Ipv4Addr, SocketAddr};
-use std::sync::Arc;
+use std::sync::{Arc, mpsc};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use foxglove::websocket::ShutdownHandle;
 use foxglove::{ChannelBuilder, Context, Encode, PartialMetadata, RawChannel};
 use foxglove::{WebSocketServer, WebSocketServerHandle};
+use tokio::net::TcpListener;
 use tokio::sync::oneshot;
 use tokio::task::JoinSet;
 use tokio::time::timeout;
@@ -45,17 +47,29 @@ impl Live {
             .name(format!("telemime {role}"))
             .message_backlog_size(BACKLOG)
             .bind(Ipv4Addr::LOCALHOST.to_string(), 0);
-        let (listener, server) = runtime.block_on(async {
-            let listener =
-                front::listen(addr).map_err(|source| LiveError::Bind { addr, source })?;
-            Ok::<_, LiveError>((listener, server.start().await?))
-        })?;
-        let at = listener.local_addr()?;
-        let behind = SocketAddr::from((Ipv4Addr::LOCALHOST, server.port()));
+        let (tx, begun) = mpsc::sync_channel(1);
         let (stop, stopped) = oneshot::channel();
+        // Whoever calls may be in a runtime of its own, where nobody may wait for another.
         let thread = std::thread::Builder::new()
             .name("viewers".into())
-            .spawn(move || runtime.block_on(serve(listener, behind, stopped)))?;
+            .spawn(move || {
+                runtime.block_on(async {
+                    let (listener, begun) = match begin(addr, server).await {
+                        Ok((listener, at, server)) => {
+                            let behind = (Ipv4Addr::LOCALHOST, server.port());
+                            (Some((listener, behind.into())), Ok((at, server)))
+                        }
+                        Err(e) => (None, Err(e)),
+                    };
+                    // If it has not been waited for, `stopped` is over too.
+                    let _ = tx.send(begun);
+                    if let Some((listener, behind)) = listener {
+                        serve(listener, behind, stopped).await;
+                    }
+                });
+            })?;
+        let begun = begun.recv().map_err(|_| io::ErrorKind::Other.into());
+        let (at, server) = begun.map_err(LiveError::System)??;
         Ok(Self {
             addr: at,
             context,
@@ -113,8 +127,17 @@ impl Drop for Live {
     }
 }
 
+async fn begin(
+    addr: SocketAddr,
+    server: WebSocketServer,
+) -> Result<(TcpListener, SocketAddr, WebSocketServerHandle), LiveError> {
+    let listener = front::listen(addr).map_err(|source| LiveError::Bind { addr, source })?;
+    let at = listener.local_addr()?;
+    Ok((listener, at, server.start().await?))
+}
+
 async fn serve(
-    listener: tokio::net::TcpListener,
+    listener: TcpListener,
     behind: SocketAddr,
     stopped: oneshot::Receiver<ShutdownHandle>,
 ) {
