@@ -22,6 +22,7 @@ use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
 use telemime_endpoint::config::{self, Layers, Settings};
 use telemime_endpoint::peers::{Peers, Role, Source, Whom};
+use telemime_endpoint::recording::To;
 use telemime_endpoint::supervisor::Supervisor;
 use telemime_endpoint::{External, HostClock, Identity, Meter, Mono, Trust, logs, metrics, quic};
 use tokio::sync::{mpsc, watch};
@@ -118,14 +119,23 @@ async fn operate(args: Args) -> anyhow::Result<()> {
         ),
         None => make_task(&args, &skills, config.rotation, &log)?,
     };
-    let scribe = args.record.as_deref().map(|path| {
+    let to = To {
+        file: args.record.as_deref(),
+        live: args.foxglove,
+    };
+    let scribe = (!to.is_nowhere()).then(|| {
         let say = {
             let log = log.clone();
             move |outcome| log.say(&Event::recording(&outcome))
         };
-        Scribe::start(path, config.rotation, say)
+        Scribe::start(to, config.rotation, say)
     });
-    let mut task = task.recorded(scribe.transpose()?);
+    let scribe = scribe.transpose()?;
+    if let Some(addr) = scribe.as_ref().and_then(Scribe::live) {
+        let url = format!("ws://{addr}");
+        log.say(&Event::Foxglove { url });
+    }
+    let mut task = task.recorded(scribe);
 
     let (quit, words) = cli::listen(args.follow_stdin, cli::OPERATOR_WORDS, || {})?;
     let meter = Meter::default();

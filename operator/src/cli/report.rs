@@ -238,6 +238,9 @@ pub enum Event {
     Metrics {
         url: String,
     },
+    Foxglove {
+        url: String,
+    },
     LinkAsked(Shape),
     Kept {
         name: String,
@@ -426,6 +429,7 @@ impl Event {
             Self::Performed { .. } => return None,
             Self::Input { source } => format!("the hand comes from {source}"),
             Self::Metrics { url } => format!("metrics {url}"),
+            Self::Foxglove { url } => format!("viewers {url}"),
             Self::Console { url } => format!("the page is at {url}"),
             Self::LinkAsked(_) => return None,
             Self::Kept { name } => format!("kept as {name}"),

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use serde::Deserialize;
 use telemime_endpoint::config::{Kind, Setting, Settings, Sheet};
-use telemime_endpoint::{Fingerprint, cli, logs};
+use telemime_endpoint::{Fingerprint, cli, logs, recording};
 
 use super::args::{Args, Axes, parse_future_bound, parse_latency};
 use super::input::InputFile;
@@ -77,6 +77,7 @@ struct File {
     record: Option<PathBuf>,
     seed: Option<u64>,
     metrics: Option<SocketAddr>,
+    foxglove: Option<SocketAddr>,
     log_format: Option<logs::Format>,
 }
 
@@ -178,6 +179,7 @@ impl Settings for Args {
                 new("input.latency_ms", "input-latency", Kind::Number, "60.0").or(0.0),
                 new("input.glitch_gate", "glitch-gate", Kind::Switch, "true").or(false),
                 new("metrics", "metrics", Kind::Text, "\"127.0.0.1:9434\""),
+                new("foxglove", "foxglove", Kind::Text, "\"127.0.0.1:8766\""),
                 new(
                     "log_format",
                     "log-format",
@@ -255,6 +257,7 @@ impl Settings for Args {
         self.record = self.record.or(file.record);
         self.seed = self.seed.or(file.seed);
         self.metrics = self.metrics.or(file.metrics);
+        self.foxglove = self.foxglove.or(file.foxglove);
         self.log_format = self.log_format.or(file.log_format);
         Ok(self)
     }
@@ -275,6 +278,8 @@ impl Settings for Args {
     }
 
     fn rehearse(&self) -> anyhow::Result<()> {
+        self.foxglove
+            .map_or(Ok(()), |_| recording::live::is_built())?;
         let named = self.learn.iter().chain(&self.skill).chain(&self.replay);
         for path in named.chain(&self.correct).chain(self.input.folder()) {
             std::fs::metadata(path).with_context(|| path.display().to_string())?;
