@@ -22,7 +22,7 @@ const FAREWELLS: usize = 3;
 /// from the end of the rest to the last sample.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
-  telemime send wave.csv --engage | telemime operator --connect robot --skill wave.skill --input - --until-end
+  telemime send wave.csv --engage | telemime operator --connect arm --input - --until-end
   telemime send wave.csv --to udp:127.0.0.1:5005 --engage")]
 pub(crate) struct Args {
     /// The recording (CSV: t,x,y,z).

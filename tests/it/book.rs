@@ -155,7 +155,10 @@ impl Reader {
             // What builds this very program is not for it to run.
             "" if line.starts_with("cargo ") || line.starts_with("export PATH") => {}
             "robot" => {
-                let robot = self.start("robot", &format!("{there} --listen 127.0.0.1:0 --follow-stdin"));
+                let robot = self.start(
+                    "robot",
+                    &format!("{there} --listen 127.0.0.1:0 --follow-stdin"),
+                );
                 let said = robot.hears("127.0.0.1:");
                 let (_, port) = said.split_once("127.0.0.1:").unwrap();
                 let port: String = port.chars().take_while(char::is_ascii_digit).collect();
@@ -223,9 +226,11 @@ fn command_lines(text: &str) -> Vec<String> {
         let line = line.trim();
         let line = line.split_once("$ ").map_or(line, |(_, line)| line.trim());
         let line = line.split(" #").next().unwrap_or(line);
-        for part in line.split("&&").map(str::trim) {
+        for part in line.split(['&', '|']).map(str::trim) {
+            // Where it goes, and what is left out, is not for the program.
+            let part = part.split(" >").next().unwrap_or(part).replace(" …", "");
             if part.starts_with("telemime ") {
-                found.push(part.to_owned());
+                found.push(part);
             }
         }
     }
