@@ -140,6 +140,14 @@ impl InputArgs {
         Ok(())
     }
 
+    /// Whether what is asked for is in this program.
+    pub(super) fn judge(&self) -> anyhow::Result<()> {
+        if cfg!(not(feature = "gamepad")) && matches!(self.input, Some(Source::Evdev(_))) {
+            return Err(read::OpenError::NotBuilt.into());
+        }
+        Ok(())
+    }
+
     /// What has to be there: the folder of frames or the device, if that is the source.
     pub(super) fn path(&self) -> Option<&PathBuf> {
         match &self.input {

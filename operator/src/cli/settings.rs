@@ -263,6 +263,7 @@ impl Settings for Args {
 
     fn judge(&self) -> anyhow::Result<()> {
         self.session()?;
+        self.input.judge()?;
         self.peer
             .as_deref()
             .map(str::parse::<Fingerprint>)

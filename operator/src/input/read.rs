@@ -13,7 +13,7 @@ use tokio::sync::mpsc;
 #[cfg(feature = "gamepad")]
 use super::device::{Device, DeviceError};
 use super::frame::{self, LONGEST, Units};
-use super::{Arrived, Fault, Kind, Source, What, source, stick, watch};
+use super::{Arrived, Fault, Kind, Source, What, stick, watch};
 use crate::depth::{Camera, CameraError, Finder, Folder, FolderError, Intrinsics, Size};
 use crate::ingest::{FPS, LengthUnit};
 use crate::session::LOST_S;
@@ -63,7 +63,9 @@ pub enum OpenError {
     #[error("which gamepad or SpaceMouse? `--input evdev:` lists them")]
     NoDevice,
     /// This program was built without them.
-    #[error("{}", source::NOT_BUILT)]
+    #[error(
+        "gamepads and SpaceMice are not in this build: `cargo build --release --features gamepad` makes one with them"
+    )]
     NotBuilt,
     /// No thread.
     #[error("no thread to read the input with: {0}")]

@@ -5,9 +5,6 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-/// Why there is no gamepad in this program.
-pub(super) const NOT_BUILT: &str = "gamepads and SpaceMice are not in this build: `cargo build --release --features gamepad` makes one with them";
-
 /// Where the hand comes from.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Source {
@@ -32,9 +29,6 @@ impl FromStr for Source {
             ("depth:-", _) => Ok(Self::DepthStdin),
             (_, Some(("depth", folder))) if !folder.is_empty() => {
                 Ok(Self::DepthFolder(folder.into()))
-            }
-            (_, Some(("evdev", _))) if cfg!(not(feature = "gamepad")) => {
-                Err(format!("`{text}`: {NOT_BUILT}"))
             }
             (_, Some(("evdev", path))) => Ok(Self::Evdev((!path.is_empty()).then(|| path.into()))),
             (_, Some(("udp", addr))) => {
