@@ -140,12 +140,17 @@ impl InputArgs {
         Ok(())
     }
 
-    /// Whether what is asked for is in this program.
+    /// Whether what is asked for can be, and is in this program.
     pub(super) fn judge(&self) -> anyhow::Result<()> {
-        if cfg!(not(feature = "gamepad")) && matches!(self.input, Some(Source::Evdev(_))) {
-            return Err(read::OpenError::NotBuilt.into());
+        match self.input {
+            Some(Source::Evdev(_)) if cfg!(not(feature = "gamepad")) => {
+                Err(read::OpenError::NotBuilt.into())
+            }
+            Some(Source::Evdev(_)) if self.engage => {
+                bail!("a gamepad or SpaceMouse has a button to hold: leave --engage out")
+            }
+            _ => Ok(()),
         }
-        Ok(())
     }
 
     /// What has to be there: the folder of frames or the device, if that is the source.
@@ -164,9 +169,6 @@ impl InputArgs {
         rotation: UnitQuaternion<f64>,
         log: &Log,
     ) -> anyhow::Result<Task> {
-        if self.engage && matches!(source, Source::Evdev(_)) {
-            bail!("a gamepad or SpaceMouse has a button to hold: leave --engage out");
-        }
         let defaults = Units::default();
         let units = Units {
             length: self.unit.unwrap_or(defaults.length),

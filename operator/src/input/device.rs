@@ -113,7 +113,9 @@ pub fn list() -> Listing {
 }
 
 fn name(device: &RawDevice) -> String {
-    device.name().unwrap_or("without a name").to_owned()
+    let name = device.name().unwrap_or("without a name");
+    // It comes out of the device, and goes to a terminal.
+    name.chars().filter(|c| !c.is_control()).collect()
 }
 
 /// Opens a device without taking it, and says what it is.
