@@ -58,6 +58,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let below = Layers::read::<Args>(args.config.as_deref(), &config::environment()).table()?;
     let args = args.clone().over(below)?;
     args.judge()?;
+    if args.input.input == Some(crate::input::Source::Evdev(None)) {
+        return input::list_devices(args.json);
+    }
     let logging = logs::start(args.log_format)?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -114,7 +117,7 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     let (task, played) = match &args.input.input {
         Some(source) => (
             args.input
-                .task(source, Clock { host: clock, epoch }, &log)?,
+                .task(source, Clock { host: clock, epoch }, config.rotation, &log)?,
             None,
         ),
         None => make_task(&args, &skills, config.rotation, &log)?,

@@ -235,6 +235,11 @@ pub enum Event {
     Input {
         source: String,
     },
+    Device {
+        source: String,
+        make: String,
+        name: String,
+    },
     Metrics {
         url: String,
     },
@@ -428,6 +433,7 @@ impl Event {
             // With one performance, the line at the end says all.
             Self::Performed { .. } => return None,
             Self::Input { source } => format!("the hand comes from {source}"),
+            Self::Device { source, make, name } => format!("{source}  {make:10}  {name}"),
             Self::Metrics { url } => format!("metrics {url}"),
             Self::Foxglove { url } => format!("viewers {url}"),
             Self::Console { url } => format!("the page is at {url}"),

@@ -12,6 +12,7 @@ use telemime_endpoint::{Fingerprint, cli, logs, recording};
 use super::args::{Args, Axes, parse_future_bound, parse_latency};
 use super::input::InputFile;
 use crate::ingest::FPS;
+use crate::input::stick::SPEED_M_S;
 use crate::placed::Placed;
 use crate::session::SessionConfig;
 
@@ -174,6 +175,7 @@ impl Settings for Args {
                 new("input.mirror", "mirror", Kind::Switch, "true").or(false),
                 new("input.frame_size", "frame-size", Kind::Text, "\"640x480\""),
                 new("input.fps", "fps", Kind::Number, "30.0").or(FPS),
+                new("input.stick_speed_m_s", "stick-speed", Kind::Number, "0.25").or(SPEED_M_S),
                 new("input.engage", "engage", Kind::Switch, "true").or(false),
                 new("input.until_end", "until-end", Kind::Switch, "true").or(false),
                 new("input.latency_ms", "input-latency", Kind::Number, "60.0").or(0.0),
@@ -264,6 +266,7 @@ impl Settings for Args {
 
     fn judge(&self) -> anyhow::Result<()> {
         self.session()?;
+        self.input.judge()?;
         self.peer
             .as_deref()
             .map(str::parse::<Fingerprint>)
@@ -281,7 +284,7 @@ impl Settings for Args {
         self.foxglove
             .map_or(Ok(()), |_| recording::live::is_built())?;
         let named = self.learn.iter().chain(&self.skill).chain(&self.replay);
-        for path in named.chain(&self.correct).chain(self.input.folder()) {
+        for path in named.chain(&self.correct).chain(self.input.path()) {
             std::fs::metadata(path).with_context(|| path.display().to_string())?;
         }
         Ok(())
