@@ -63,8 +63,11 @@ mod shown {
         daemon.event("foxglove")["url"].as_str().unwrap().to_owned()
     }
 
+    /// Topics, and what was said on them.
+    type Messages = Vec<(String, Vec<u8>)>;
+
     /// All that is shown until the daemon ends: the schemas of the topics, and the messages.
-    fn everything(mut viewer: Viewer) -> (BTreeMap<String, String>, Vec<(String, Vec<u8>)>) {
+    fn everything(mut viewer: Viewer) -> (BTreeMap<String, String>, Messages) {
         let (mut schemas, mut messages) = (BTreeMap::new(), Vec::new());
         while let Some(said) = viewer.next() {
             match said {
