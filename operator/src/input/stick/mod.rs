@@ -73,7 +73,7 @@ pub struct Change {
 /// A device and the hand it moves.
 ///
 /// The hand moves only while the button to hold is held, and that button is the clutch: what it was at a tick is in every
-/// frame. A second button opens and closes the gripper by turns, while the first is held; until it was pressed for the first
+/// frame; one that was held before the first tick counts once it has been let go. A second button opens and closes the gripper by turns, while the first is held; until it was pressed for the first
 /// time nothing is said of the gripper, so that an arm which holds something goes on holding it.
 #[derive(Debug, Clone)]
 pub struct Stick {
@@ -83,6 +83,8 @@ pub struct Stick {
     grip: u16,
     manner: Manner,
     held: bool,
+    /// It was held when the device was opened: nobody pressed it for this.
+    stuck: bool,
     /// It was let go since the last tick.
     let_go: bool,
     grip_down: bool,
@@ -101,6 +103,7 @@ impl Stick {
             grip: layout.grip,
             manner,
             held: false,
+            stuck: false,
             let_go: false,
             grip_down: false,
             closed: None,
@@ -114,8 +117,9 @@ impl Stick {
         let down = change.value != 0;
         match change.control {
             Control::Key if change.code == self.hold => {
+                self.stuck = down && (self.stuck || self.ticked.is_none());
                 self.let_go |= self.held && !down;
-                self.held = down;
+                self.held = down && !self.stuck;
             }
             Control::Key if change.code == self.grip => {
                 if down && !self.grip_down && self.held {

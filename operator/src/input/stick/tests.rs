@@ -252,6 +252,25 @@ fn the_hand_moves_only_while_the_button_is_held() {
 }
 
 #[test]
+fn a_button_that_was_held_when_the_device_was_opened_is_not_a_press() {
+    let mut stick = Stick::new(&Layout::of(&pad()).unwrap(), Manner::default());
+    let t = Stamp(1_000_000_000);
+    let key = |stick: &mut Stick, value| {
+        stick.handle(Change {
+            control: Control::Key,
+            code: PAD_HOLD,
+            value,
+            t,
+        });
+        stick.tick(t).1.engage
+    };
+    assert_eq!(key(&mut stick, 1), Some(false));
+    assert_eq!(key(&mut stick, 2), Some(false), "nor when it repeats");
+    assert_eq!(key(&mut stick, 0), Some(false));
+    assert_eq!(key(&mut stick, 1), Some(true));
+}
+
+#[test]
 fn the_gripper_is_left_alone_until_its_button_is_pressed_while_the_other_is_held() {
     let mut bench = Bench::new(&pad());
     bench.key(PAD_GRIP, 1);
