@@ -12,10 +12,13 @@ fn a_build_without_viewers_says_how_to_build_one_with_them() {
     let key = dir.path().join("daemon.key");
     let key = key.to_str().unwrap();
     let robot = ["robot", "--listen", "127.0.0.1:0", "--identity", key];
+    let peer = "ab".repeat(32);
     let operator = [
         "operator",
         "--connect",
         "127.0.0.1:1",
+        "--peer",
+        &peer,
         "--identity",
         key,
         "--console",
