@@ -66,9 +66,9 @@ impl Sink {
                 connected.with_context(|| format!("cannot send to {addr}"))?;
                 Ok(Self::Udp(socket))
             }
-            Source::DepthStdin | Source::DepthFolder(_) => {
+            Source::DepthStdin | Source::DepthFolder(_) | Source::Evdev(_) => {
                 bail!(
-                    "a recording is sent to - or udp:ADDRESS:PORT; depth frames are an input only"
+                    "a recording is sent to - or udp:ADDRESS:PORT; depth frames and gamepads are inputs only"
                 )
             }
         }

@@ -22,6 +22,7 @@ use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
 use telemime_endpoint::config::{self, Layers, Settings};
 use telemime_endpoint::peers::{Peers, Role, Source, Whom};
+use telemime_endpoint::recording::To;
 use telemime_endpoint::supervisor::Supervisor;
 use telemime_endpoint::{External, HostClock, Identity, Meter, Mono, Trust, logs, metrics, quic};
 use tokio::sync::{mpsc, watch};
@@ -57,6 +58,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let below = Layers::read::<Args>(args.config.as_deref(), &config::environment()).table()?;
     let args = args.clone().over(below)?;
     args.judge()?;
+    if args.input.input == Some(crate::input::Source::Evdev(None)) {
+        return input::list_devices(args.json);
+    }
     let logging = logs::start(args.log_format)?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -113,19 +117,28 @@ async fn operate(args: Args) -> anyhow::Result<()> {
     let (task, played) = match &args.input.input {
         Some(source) => (
             args.input
-                .task(source, Clock { host: clock, epoch }, &log)?,
+                .task(source, Clock { host: clock, epoch }, config.rotation, &log)?,
             None,
         ),
         None => make_task(&args, &skills, config.rotation, &log)?,
     };
-    let scribe = args.record.as_deref().map(|path| {
+    let to = To {
+        file: args.record.as_deref(),
+        live: args.foxglove,
+    };
+    let scribe = (!to.is_nowhere()).then(|| {
         let say = {
             let log = log.clone();
             move |outcome| log.say(&Event::recording(&outcome))
         };
-        Scribe::start(path, config.rotation, say)
+        Scribe::start(to, config.rotation, say)
     });
-    let mut task = task.recorded(scribe.transpose()?);
+    let scribe = scribe.transpose()?;
+    if let Some(addr) = scribe.as_ref().and_then(Scribe::live) {
+        let url = format!("ws://{addr}");
+        log.say(&Event::Foxglove { url });
+    }
+    let mut task = task.recorded(scribe);
 
     let (quit, words) = cli::listen(args.follow_stdin, cli::OPERATOR_WORDS, || {})?;
     let meter = Meter::default();

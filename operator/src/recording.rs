@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::path::Path;
+use std::net::SocketAddr;
 
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_endpoint::recording::{
-    self, At, Drawn, Hand, Json, Look, OperatorState, Outcome, RecordError, Tape, in_base, info,
-    points, warning,
+    self, At, Drawn, Hand, Json, Look, OperatorState, Outcome, RecordError, Tape, To, in_base,
+    info, points, warning,
 };
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::arm::WireArm;
@@ -81,13 +81,13 @@ impl fmt::Debug for Scribe {
 }
 
 impl Scribe {
-    /// Records into the new file `path`; `rotation` turns the hand's axes into base axes, and `say` is told what became
+    /// Records to a new file, or for viewers; `rotation` turns the hand's axes into base axes, and `say` is told what became
     /// of the file.
     ///
     /// # Errors
     /// [`RecordError`].
     pub fn start(
-        path: &Path,
+        to: To<'_>,
         rotation: UnitQuaternion<f64>,
         say: impl Fn(Outcome) + Send + 'static,
     ) -> Result<Self, RecordError> {
@@ -103,7 +103,7 @@ impl Scribe {
         let mut writer = Writer::default();
         let write = move |tape: &mut Tape, entry| writer.write(tape, entry);
         Ok(Self {
-            tape: recording::Recording::start(path, about, write, say)?,
+            tape: recording::Recording::start(to, about, write, say)?,
             rotation,
             mapping: None,
             session: 0,
@@ -114,6 +114,11 @@ impl Scribe {
             next: Stamp(i64::MIN),
             seen: Stamp::ZERO,
         })
+    }
+
+    /// Where viewers connect, if they can.
+    pub fn live(&self) -> Option<SocketAddr> {
+        self.tape.live()
     }
 
     /// Something happened in the session.

@@ -31,6 +31,7 @@ use crate::daemon::{Attendant, Daemon, Failure, Notice};
 use crate::desk::Desk;
 use crate::driver::FASTEST_HZ;
 use crate::driver::bridge::{Bridge, Words};
+use crate::recording::Scribe;
 use crate::refused::Refused;
 use crate::rig::Rig;
 use crate::servo::thread::Servo;
@@ -134,6 +135,10 @@ pub struct Args {
     /// Serve metrics for Prometheus at http://ADDR/metrics [127.0.0.1:9433 if no address is given].
     #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = METRICS)]
     pub metrics: Option<SocketAddr>,
+    /// Show viewers (Foxglove, Lichtblick) at ws://ADDR what --record NAME.mcap would write, as it happens
+    /// [127.0.0.1:8765 if no address is given]; only in a program built with `--features live`.
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = FOXGLOVE)]
+    pub foxglove: Option<SocketAddr>,
     /// Log to stderr what happens, each line with time and level, instead of telling it on stdout; RUST_LOG chooses what.
     #[arg(long, value_name = "FORMAT", value_enum)]
     pub log_format: Option<logs::Format>,
@@ -165,6 +170,9 @@ pub struct Args {
 
 /// Where metrics are served unless said otherwise.
 const METRICS: &str = "127.0.0.1:9433";
+
+/// Where viewers connect unless said otherwise.
+const FOXGLOVE: &str = "127.0.0.1:8765";
 
 /// `JOINT=VALUE` as a joint's name and its value, rad or m.
 ///
@@ -279,7 +287,8 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         json: args.json,
         out,
     };
-    let scribe = record::scribe(args.record.as_deref(), &rig, &log)?;
+    let scribe = record::scribe(args.record.as_deref(), args.foxglove, &rig, &log)?;
+    let live = scribe.as_ref().and_then(Scribe::live);
     let keeper = match args.black_box.clone() {
         Some(dir) => {
             // Better now than after the stop that it was for.
@@ -369,6 +378,12 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         .showing(rig.described())
         .with_black_box(asker)
         .recorded(scribe);
+    if let Some(addr) = live {
+        let url = format!("ws://{addr}");
+        log.say(&Event::Foxglove { url: url.clone() }, || {
+            format!("viewers {url}")
+        });
+    }
     let (notices, heard) = mpsc::unbounded_channel();
     let listener = tokio::spawn(listen_to(
         heard,

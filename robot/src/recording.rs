@@ -1,11 +1,11 @@
 //! What the robot records of itself, on the session clock: docs/recordings.md.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::net::SocketAddr;
 
 use telemime_endpoint::Mono;
 use telemime_endpoint::recording::{
-    self, At, Drawn, Json, Look, Outcome, RecordError, RobotState, Tape, in_base, info, warning,
+    self, At, Drawn, Json, Look, Outcome, RecordError, RobotState, Tape, To, in_base, info, warning,
 };
 use telemime_protocol::time::Stamp;
 
@@ -64,12 +64,12 @@ pub struct Scribe {
 }
 
 impl Scribe {
-    /// Records what `rig` does into the new file `path`; `say` is told what became of each file.
+    /// Records what `rig` does to a new file, or for viewers; `say` is told what became of each file.
     ///
     /// # Errors
     /// [`RecordError`].
     pub fn start(
-        path: &Path,
+        to: To<'_>,
         rig: &Rig,
         say: impl Fn(Outcome) + Send + 'static,
     ) -> Result<Self, RecordError> {
@@ -93,13 +93,18 @@ impl Scribe {
         };
         let write = move |tape: &mut Tape, entry| writer.write(tape, entry);
         Ok(Self {
-            tape: recording::Recording::start(path, about, write, say)?,
+            tape: recording::Recording::start(to, about, write, say)?,
             offset_ns: None,
             next: Mono(i64::MIN),
             transitions: None,
             engagement: Ticket::default(),
             faulty: false,
         })
+    }
+
+    /// Where viewers connect, if they can.
+    pub fn live(&self) -> Option<SocketAddr> {
+        self.tape.live()
     }
 
     /// Takes the report of a tick, and what the session that is under way knows.

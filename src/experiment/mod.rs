@@ -168,7 +168,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 
 fn read(name: &str) -> anyhow::Result<Plan> {
     let path = Path::new(name);
-    if !path.exists()
+    if !path.is_file()
         && let Some(text) = plans::ready(name)
     {
         return Ok(Plan::parse(name, text, Path::new("."))?);

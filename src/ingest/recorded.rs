@@ -169,7 +169,7 @@ fn table(driven: &[Hand]) -> String {
 mod tests {
     use std::cell::RefCell;
 
-    use telemime_endpoint::recording::{At, Json, Recording, Tape};
+    use telemime_endpoint::recording::{At, Json, Recording, Tape, To};
     use telemime_protocol::time::Stamp;
 
     use super::*;
@@ -219,7 +219,11 @@ mod tests {
             }
             tape.message("/operator/hand", at, &Json(hand))
         };
-        let recording = Recording::start(&path, [].into(), write, |_| ()).unwrap();
+        let to = To {
+            file: Some(&path),
+            live: None,
+        };
+        let recording = Recording::start(to, [].into(), write, |_| ()).unwrap();
         // Not followed; followed; declined; too short; followed; and after the robot's restart the same numbers again.
         let spans = [
             (0, 1, 0, 20),

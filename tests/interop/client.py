@@ -29,6 +29,7 @@ class Operator(QuicConnectionProtocol):
         self.stream, self.buffer, self.epoch = None, b"", None
         self.control, self.telemetry, self.pings, self.closed = asyncio.Queue(), [], 0, None
         self.reception = None
+        self.servo = None
         self.fresh = asyncio.Event()
 
     @staticmethod

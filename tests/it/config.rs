@@ -57,6 +57,10 @@ fn values() -> BTreeMap<&'static str, [&'static str; 3]> {
         ("realtime", ["41", "42", "43"]),
         ("black_box", ["\"a\"", "b", "c"]),
         ("metrics", ["\"127.0.0.1:1\"", "127.0.0.1:2", "127.0.0.1:3"]),
+        (
+            "foxglove",
+            ["\"127.0.0.1:1\"", "127.0.0.1:2", "127.0.0.1:3"],
+        ),
         ("log_format", ["\"text\"", "json", "text"]),
         ("learn", ["[\"a\"]", "b, c", "d"]),
         ("match", ["\"a*\"", "[0-9]*", "c*"]),
@@ -101,6 +105,7 @@ fn values() -> BTreeMap<&'static str, [&'static str; 3]> {
         ("input.mirror", ["false", "true", ""]),
         ("input.frame_size", ["\"640x480\"", "320x240", "160x120"]),
         ("input.fps", ["10", "20", "30"]),
+        ("input.stick_speed_m_s", ["0.1", "0.2", "0.3"]),
         ("input.engage", ["false", "true", ""]),
         ("input.until_end", ["false", "true", ""]),
         ("input.latency_ms", ["10", "20", "30ms"]),

@@ -131,3 +131,25 @@ fn an_input_that_anybody_could_reach_or_nobody_can_is_refused_in_a_line() {
     let port = taken.local_addr().unwrap().port();
     assert!(said(&["--input", &format!("udp:{port}")]).contains("another port"));
 }
+
+#[test]
+fn a_gamepad_is_taken_where_it_is_built_in_and_else_the_refusal_says_how_to_build_it() {
+    let input = |source: &str| {
+        let out = Command::new(env!("CARGO_BIN_EXE_telemime"))
+            .args(["operator", "--input", source])
+            .output()
+            .unwrap();
+        assert!(out.stdout.is_empty() || out.status.success());
+        (out.status.code(), String::from_utf8(out.stderr).unwrap())
+    };
+    for source in ["evdev:", "evdev:/dev/input/event0"] {
+        let (code, told) = input(source);
+        if cfg!(feature = "gamepad") {
+            assert!(!told.contains("--features"), "{told}");
+        } else {
+            assert_eq!((code, told.lines().count()), (Some(1), 1), "{told}");
+            let how = "cargo build --release --features gamepad";
+            assert!(told.contains(how), "{told}");
+        }
+    }
+}

@@ -28,6 +28,7 @@ mod input;
 mod interop;
 mod layout;
 mod link;
+mod live;
 mod mirror;
 mod operations;
 mod overhead;

@@ -153,6 +153,10 @@ pub struct Args {
     /// Serve metrics for Prometheus at http://ADDR/metrics [127.0.0.1:9434 if no address is given].
     #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = METRICS)]
     pub metrics: Option<SocketAddr>,
+    /// Show viewers (Foxglove, Lichtblick) at ws://ADDR what --record would write, as it happens [127.0.0.1:8766 if no
+    /// address is given]; only in a program built with `--features live`.
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = FOXGLOVE)]
+    pub foxglove: Option<SocketAddr>,
     /// Log to stderr what happens, each line with time and level, instead of telling it on stdout; RUST_LOG chooses what.
     #[arg(long, value_name = "FORMAT", value_enum)]
     pub log_format: Option<logs::Format>,
@@ -172,6 +176,9 @@ pub struct Args {
 
 /// Where metrics are served unless said otherwise.
 const METRICS: &str = "127.0.0.1:9434";
+
+/// Where viewers connect unless said otherwise.
+const FOXGLOVE: &str = "127.0.0.1:8766";
 
 /// Where the page is served unless said otherwise.
 const CONSOLE: &str = "127.0.0.1:8723";

@@ -235,7 +235,15 @@ pub enum Event {
     Input {
         source: String,
     },
+    Device {
+        source: String,
+        make: String,
+        name: String,
+    },
     Metrics {
+        url: String,
+    },
+    Foxglove {
         url: String,
     },
     LinkAsked(Shape),
@@ -425,7 +433,9 @@ impl Event {
             // With one performance, the line at the end says all.
             Self::Performed { .. } => return None,
             Self::Input { source } => format!("the hand comes from {source}"),
+            Self::Device { source, make, name } => format!("{source}  {make:10}  {name}"),
             Self::Metrics { url } => format!("metrics {url}"),
+            Self::Foxglove { url } => format!("viewers {url}"),
             Self::Console { url } => format!("the page is at {url}"),
             Self::LinkAsked(_) => return None,
             Self::Kept { name } => format!("kept as {name}"),

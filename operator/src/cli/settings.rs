@@ -7,11 +7,12 @@ use std::path::PathBuf;
 use anyhow::Context;
 use serde::Deserialize;
 use telemime_endpoint::config::{Kind, Setting, Settings, Sheet};
-use telemime_endpoint::{Fingerprint, cli, logs};
+use telemime_endpoint::{Fingerprint, cli, logs, recording};
 
 use super::args::{Args, Axes, parse_future_bound, parse_latency};
 use super::input::InputFile;
 use crate::ingest::FPS;
+use crate::input::stick::SPEED_M_S;
 use crate::placed::Placed;
 use crate::session::SessionConfig;
 
@@ -77,6 +78,7 @@ struct File {
     record: Option<PathBuf>,
     seed: Option<u64>,
     metrics: Option<SocketAddr>,
+    foxglove: Option<SocketAddr>,
     log_format: Option<logs::Format>,
 }
 
@@ -173,11 +175,13 @@ impl Settings for Args {
                 new("input.mirror", "mirror", Kind::Switch, "true").or(false),
                 new("input.frame_size", "frame-size", Kind::Text, "\"640x480\""),
                 new("input.fps", "fps", Kind::Number, "30.0").or(FPS),
+                new("input.stick_speed_m_s", "stick-speed", Kind::Number, "0.25").or(SPEED_M_S),
                 new("input.engage", "engage", Kind::Switch, "true").or(false),
                 new("input.until_end", "until-end", Kind::Switch, "true").or(false),
                 new("input.latency_ms", "input-latency", Kind::Number, "60.0").or(0.0),
                 new("input.glitch_gate", "glitch-gate", Kind::Switch, "true").or(false),
                 new("metrics", "metrics", Kind::Text, "\"127.0.0.1:9434\""),
+                new("foxglove", "foxglove", Kind::Text, "\"127.0.0.1:8766\""),
                 new(
                     "log_format",
                     "log-format",
@@ -255,12 +259,14 @@ impl Settings for Args {
         self.record = self.record.or(file.record);
         self.seed = self.seed.or(file.seed);
         self.metrics = self.metrics.or(file.metrics);
+        self.foxglove = self.foxglove.or(file.foxglove);
         self.log_format = self.log_format.or(file.log_format);
         Ok(self)
     }
 
     fn judge(&self) -> anyhow::Result<()> {
         self.session()?;
+        self.input.judge()?;
         self.peer
             .as_deref()
             .map(str::parse::<Fingerprint>)
@@ -275,8 +281,10 @@ impl Settings for Args {
     }
 
     fn rehearse(&self) -> anyhow::Result<()> {
+        self.foxglove
+            .map_or(Ok(()), |_| recording::live::is_built())?;
         let named = self.learn.iter().chain(&self.skill).chain(&self.replay);
-        for path in named.chain(&self.correct).chain(self.input.folder()) {
+        for path in named.chain(&self.correct).chain(self.input.path()) {
             std::fs::metadata(path).with_context(|| path.display().to_string())?;
         }
         Ok(())

@@ -14,7 +14,7 @@ use crate::ingest::{LengthUnit, TimeUnit};
 pub const LONGEST: usize = 16 * 1024;
 
 /// A hand is nearer than this to the tracker, m.
-const FARTHEST_M: f64 = 100.0;
+pub(super) const FARTHEST_M: f64 = 100.0;
 
 /// A quaternion's norm may be off by this much: it is written with a few digits.
 const NORM_SLACK: f64 = 0.01;

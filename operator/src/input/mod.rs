@@ -1,13 +1,16 @@
-//! A hand that is tracked while it drives: lines of JSON on standard input or by UDP, or depth frames.
+//! A hand that is tracked while it drives: lines of JSON on standard input or by UDP, depth frames, or a gamepad.
 //!
 //! `docs/input.md` is the format for people who write a sender. A thread reads and decodes ([`read`]); the [`Driver`] holds
 //! the clutch and feeds the session, sans-IO. What is wrong is dropped and counted ([`Tally`]); a source that falls silent is a
 //! clutch that was let go.
 
+#[cfg(feature = "gamepad")]
+pub mod device;
 mod driver;
 pub mod frame;
 pub mod read;
 mod source;
+pub mod stick;
 mod tally;
 #[cfg(test)]
 mod tests;

@@ -10,8 +10,10 @@ use telemime_endpoint::{HostClock, Mono};
 use telemime_protocol::time::Stamp;
 use tokio::sync::mpsc;
 
+#[cfg(feature = "gamepad")]
+use super::device::{Device, DeviceError};
 use super::frame::{self, LONGEST, Units};
-use super::{Arrived, Fault, Kind, Source, What, watch};
+use super::{Arrived, Fault, Kind, Source, What, stick, watch};
 use crate::depth::{Camera, CameraError, Finder, Folder, FolderError, Intrinsics, Size};
 use crate::ingest::{FPS, LengthUnit};
 use crate::session::LOST_S;
@@ -53,6 +55,18 @@ pub enum OpenError {
     /// Raw frames do not say how large they are.
     #[error("how large is a depth frame? Give --frame-size WIDTHxHEIGHT")]
     Size,
+    /// The device cannot be used.
+    #[cfg(feature = "gamepad")]
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    /// None was named.
+    #[error("which gamepad or SpaceMouse? `--input evdev:` lists them")]
+    NoDevice,
+    /// This program was built without them.
+    #[error(
+        "gamepads and SpaceMice are not in this build: `cargo build --release --features gamepad` makes one with them"
+    )]
+    NotBuilt,
     /// No thread.
     #[error("no thread to read the input with: {0}")]
     Thread(io::Error),
@@ -67,6 +81,8 @@ pub struct Settings {
     pub units: Units,
     /// Of depth frames.
     pub depth: Depth,
+    /// Of a gamepad or SpaceMouse.
+    pub stick: stick::Manner,
 }
 
 /// What depth frames are.
@@ -295,7 +311,12 @@ pub fn open(
     clock: Clock,
 ) -> Result<(Inlet, String), OpenError> {
     let (to, mut inlet) = channel(Box::new(move || clock.now()));
-    let Settings { from, units, depth } = settings;
+    let Settings {
+        from,
+        units,
+        depth,
+        stick,
+    } = settings;
     let mut name = source.to_string();
     let read: Box<dyn FnOnce() + Send> = match source {
         Source::Stdin => Box::new(move || lines(io::stdin(), &units, to)),
@@ -319,6 +340,18 @@ pub fn open(
             let (go, begin) = std::sync::mpsc::channel();
             inlet.go = Some(go);
             Box::new(move || watch::folder(&folder, finder, depth.fps, &begin, to))
+        }
+        Source::Evdev(None) => return Err(OpenError::NoDevice),
+        #[cfg(feature = "gamepad")]
+        Source::Evdev(Some(path)) => {
+            let (mut device, stick, called) = Device::open(path, stick)?;
+            name = called;
+            Box::new(move || stick::follow(stick, |stick, now| device.read(stick, now), to))
+        }
+        #[cfg(not(feature = "gamepad"))]
+        Source::Evdev(Some(_)) => {
+            let _ = stick;
+            return Err(OpenError::NotBuilt);
         }
     };
     // Never joined: a blocking read cannot be cancelled, and ends with the process.

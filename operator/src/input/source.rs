@@ -16,6 +16,8 @@ pub enum Source {
     DepthStdin,
     /// A folder of depth frames, at their rate.
     DepthFolder(PathBuf),
+    /// A gamepad or SpaceMouse of this host; none, whichever there are, to be listed.
+    Evdev(Option<PathBuf>),
 }
 
 impl FromStr for Source {
@@ -28,6 +30,7 @@ impl FromStr for Source {
             (_, Some(("depth", folder))) if !folder.is_empty() => {
                 Ok(Self::DepthFolder(folder.into()))
             }
+            (_, Some(("evdev", path))) => Ok(Self::Evdev((!path.is_empty()).then(|| path.into()))),
             (_, Some(("udp", addr))) => {
                 let port = |port: u16| SocketAddr::from(([127, 0, 0, 1], port));
                 let addr = addr.parse().or_else(|_| addr.parse().map(port));
@@ -36,7 +39,7 @@ impl FromStr for Source {
                 })
             }
             _ => Err(format!(
-                "`{text}`: write - (lines on standard input), udp:PORT, depth:FOLDER or depth:- (frames on standard input)"
+                "`{text}`: write - (lines on standard input), udp:PORT, depth:FOLDER, depth:- (frames on standard input) or evdev:/dev/input/eventN"
             )),
         }
     }
@@ -49,6 +52,8 @@ impl fmt::Display for Source {
             Self::Udp(addr) => write!(f, "udp:{addr}"),
             Self::DepthStdin => f.write_str("depth frames on standard input"),
             Self::DepthFolder(folder) => write!(f, "the depth frames in {}", folder.display()),
+            Self::Evdev(Some(path)) => write!(f, "evdev:{}", path.display()),
+            Self::Evdev(None) => f.write_str("evdev:"),
         }
     }
 }

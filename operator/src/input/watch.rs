@@ -52,7 +52,8 @@ pub(super) fn folder(
     to.end("that was the last frame".into());
 }
 
-fn wait(to: &Outlet, due: Stamp) {
+/// Waits until the clock of `to` shows `due`.
+pub(super) fn wait(to: &Outlet, due: Stamp) {
     loop {
         let left_s = due.secs_since(to.now());
         if !(left_s > 0.0) {

@@ -10,7 +10,7 @@ use tracing_subscriber::fmt::MakeWriter;
 use crate::cli::Printer;
 
 /// What is logged unless `RUST_LOG` says otherwise: what the daemon does, and what its libraries warn of.
-const USUAL: &str = "warn,telemime=info";
+const USUAL: &str = "warn,foxglove=off,telemime=info";
 
 /// How a log's lines are written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Deserialize)]

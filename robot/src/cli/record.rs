@@ -2,12 +2,13 @@
 
 use std::fs::File;
 use std::io::{ErrorKind, Write as _};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 
 use anyhow::{Context, bail};
 
-use telemime_endpoint::recording;
+use telemime_endpoint::recording::{self, To};
 
 use super::report::Log;
 use crate::recording::Scribe;
@@ -24,14 +25,21 @@ pub(super) fn ticks(path: Option<&Path>, rig: &Rig) -> anyhow::Result<Option<Tic
         .transpose()
 }
 
-/// A recording that viewers open, if that is what is wanted.
-pub(super) fn scribe(path: Option<&Path>, rig: &Rig, log: &Log) -> anyhow::Result<Option<Scribe>> {
-    let Some(path) = path.filter(|path| recording::is_named(path)) else {
+/// A recording that viewers open, or look at while it is made, if that is what is wanted.
+pub(super) fn scribe(
+    path: Option<&Path>,
+    live: Option<SocketAddr>,
+    rig: &Rig,
+    log: &Log,
+) -> anyhow::Result<Option<Scribe>> {
+    let file = path.filter(|path| recording::is_named(path));
+    let to = To { file, live };
+    if to.is_nowhere() {
         return Ok(None);
-    };
+    }
     let log = log.clone();
     let say = move |outcome| log.recording(&outcome);
-    Ok(Some(Scribe::start(path, rig, say)?))
+    Ok(Some(Scribe::start(to, rig, say)?))
 }
 
 /// A new file at `path`; where one is, at the same with the next free number.

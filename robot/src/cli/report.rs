@@ -34,6 +34,9 @@ pub enum Event {
     Metrics {
         url: String,
     },
+    Foxglove {
+        url: String,
+    },
     Connected {
         epoch: u32,
         version: u16,

@@ -9,7 +9,7 @@ use nalgebra::Vector3;
 use serde::Deserialize;
 use telemime_endpoint::Fingerprint;
 use telemime_endpoint::config::{Kind, Setting, Settings, Sheet};
-use telemime_endpoint::{admin, cli, logs};
+use telemime_endpoint::{admin, cli, logs, recording};
 use telemime_sim::arm::{DeadTime, LoadOptions};
 
 use super::{Args, surroundings};
@@ -56,6 +56,7 @@ struct File {
     realtime: Option<u8>,
     black_box: Option<PathBuf>,
     metrics: Option<SocketAddr>,
+    foxglove: Option<SocketAddr>,
     log_format: Option<logs::Format>,
 }
 
@@ -143,6 +144,7 @@ impl Settings for Args {
                 new("realtime", "realtime", Kind::Integer, "50"),
                 new("black_box", "black-box", Kind::Text, "\"blackbox\""),
                 new("metrics", "metrics", Kind::Text, "\"127.0.0.1:9433\""),
+                new("foxglove", "foxglove", Kind::Text, "\"127.0.0.1:8765\""),
                 new(
                     "log_format",
                     "log-format",
@@ -191,6 +193,7 @@ impl Settings for Args {
         self.realtime = self.realtime.or(file.realtime);
         self.black_box = self.black_box.or(file.black_box);
         self.metrics = self.metrics.or(file.metrics);
+        self.foxglove = self.foxglove.or(file.foxglove);
         self.log_format = self.log_format.or(file.log_format);
         Ok(self)
     }
@@ -222,6 +225,8 @@ impl Settings for Args {
     }
 
     fn rehearse(&self) -> anyhow::Result<()> {
+        self.foxglove
+            .map_or(Ok(()), |_| recording::live::is_built())?;
         let options = self.rig_options()?;
         let (urdf, text) = Rig::text(options.urdf.as_deref())?;
         if self.driver.is_some() {

@@ -1,15 +1,19 @@
 //! Recordings in [MCAP](https://mcap.dev), which Foxglove, Lichtblick and rerun open: docs/recordings.md.
 //!
 //! What drives pushes entries; a thread of their own turns them into messages and writes them. It can hold nothing up: the
-//! queue is bounded, the newest wins, and a disk that is full ends the recording and nothing else.
+//! queue is bounded, the newest wins, and a disk that is full ends the recording and nothing else. The same messages go to
+//! viewers that are connected, if they are to ([`live`]).
 
+pub mod live;
 mod own;
 mod queue;
 pub mod read;
+mod reel;
 mod shapes;
 mod tape;
 
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -17,6 +21,7 @@ use std::time::Duration;
 
 use telemime_protocol::time::Stamp;
 
+use live::Live;
 pub use own::{Hand, Json, OperatorState, Own, RobotState};
 use queue::{Queue, Taken};
 pub use shapes::{BASE, Drawn, Look, in_base, info, points, warning};
@@ -70,6 +75,25 @@ pub enum RecordError {
     /// The system gives no thread.
     #[error("no thread to record from: {0}")]
     Thread(std::io::Error),
+    /// Viewers cannot be waited for.
+    #[error(transparent)]
+    Live(#[from] live::LiveError),
+}
+
+/// Where a recording goes.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct To<'a> {
+    /// Into this new file.
+    pub file: Option<&'a Path>,
+    /// To viewers that connect here; port 0: any that is free.
+    pub live: Option<SocketAddr>,
+}
+
+impl To<'_> {
+    /// There is nowhere for it to go.
+    pub fn is_nowhere(&self) -> bool {
+        self.file.is_none() && self.live.is_none()
+    }
 }
 
 /// What became of a file.
@@ -106,27 +130,32 @@ pub fn is_named(path: &Path) -> bool {
 /// A recording under way; dropping it writes what is still to be written, and ends the file.
 #[derive(Debug)]
 pub struct Recording<E> {
+    live: Option<SocketAddr>,
     queue: Arc<Queue<E>>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl<E: Send + 'static> Recording<E> {
-    /// Records into the new file `path`, which begins by saying what it is `about`. `write` makes messages of an entry;
-    /// `say` is told once of every file that has ended, on the recording's thread.
+    /// Records `to` a new file, which begins by saying what it is `about`, to viewers, or both. `write` makes messages of
+    /// an entry; `say` is told once of every file that has ended, on the recording's thread.
     ///
     /// # Errors
-    /// [`RecordError`]: the file is not called NAME.mcap, exists or cannot be begun, or there is no thread.
+    /// [`RecordError`]: the file is not called NAME.mcap, exists or cannot be begun, viewers cannot be waited for, or there
+    /// is no thread.
     pub fn start(
-        path: &Path,
+        to: To<'_>,
         about: BTreeMap<String, String>,
         mut write: impl FnMut(&mut Tape, E) -> Result<(), RecordError> + Send + 'static,
         say: impl Fn(Outcome) + Send + 'static,
     ) -> Result<Self, RecordError> {
-        if !is_named(path) {
+        if let Some(path) = to.file.filter(|path| !is_named(path)) {
             let path = path.to_owned();
             return Err(RecordError::Name { path });
         }
-        let mut tape = Tape::create(path, about)?;
+        let role = about.get("role").map_or("", String::as_str);
+        let live = to.live.map(|addr| Live::start(addr, role)).transpose()?;
+        let at = live.as_ref().map(Live::addr);
+        let mut tape = Tape::create(to.file, live, about)?;
         let queue = Arc::new(Queue::new());
         let theirs = Arc::clone(&queue);
         let thread = std::thread::Builder::new()
@@ -134,13 +163,22 @@ impl<E: Send + 'static> Recording<E> {
             .spawn(move || {
                 let ended = run(&theirs, &mut tape, &mut write, &say);
                 theirs.close();
-                say(tape.end(ended.err()));
+                tell(&mut tape, &say);
+                if let Some(outcome) = tape.end(ended.err()) {
+                    say(outcome);
+                }
             })
             .map_err(RecordError::Thread)?;
         Ok(Self {
+            live: at,
             queue,
             thread: Some(thread),
         })
+    }
+
+    /// Where viewers connect, if they can.
+    pub fn live(&self) -> Option<SocketAddr> {
+        self.live
     }
 
     /// Leaves an entry to be written; never waits.
@@ -165,14 +203,19 @@ fn run<E>(
         tape.lost(dropped)?;
         for entry in entries {
             write(tape, entry)?;
-            if let Some(outcome) = tape.take_ended() {
-                say(outcome);
-            }
+            tell(tape, say);
         }
         if closed {
             return Ok(());
         }
         tape.flush(idle)?;
+        tell(tape, say);
+    }
+}
+
+fn tell(tape: &mut Tape, say: &impl Fn(Outcome)) {
+    while let Some(outcome) = tape.take_ended() {
+        say(outcome);
     }
 }
 

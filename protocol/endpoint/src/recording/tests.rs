@@ -28,6 +28,13 @@ fn hand(ms: i64) -> Hand {
     }
 }
 
+fn into(path: &Path) -> To<'_> {
+    To {
+        file: Some(path),
+        live: None,
+    }
+}
+
 /// Entries are times, ms; each becomes a hand and a pose.
 fn write(tape: &mut Tape, ms: i64) -> Result<(), RecordError> {
     tape.message("/hand", At::once(t(ms)), &Json(hand(ms)))?;
@@ -42,7 +49,7 @@ fn write(tape: &mut Tape, ms: i64) -> Result<(), RecordError> {
 fn record(path: &Path, entries: impl IntoIterator<Item = i64>) -> Outcome {
     let (tx, rx) = std::sync::mpsc::channel();
     let say = move |outcome| drop(tx.send(outcome));
-    let recording = Recording::start(path, about(), write, say).unwrap();
+    let recording = Recording::start(into(path), about(), write, say).unwrap();
     entries.into_iter().for_each(|ms| recording.push(ms));
     drop(recording);
     rx.recv().unwrap()
@@ -75,9 +82,9 @@ fn what_is_written_is_read_back_with_both_times() {
         (0..300).map(|i| hand(1000 + 10 * i)).collect::<Vec<_>>()
     );
     assert!(contents.complete);
-    assert_eq!(contents.metadata[tape::ABOUT]["role"], "test");
-    assert_eq!(contents.metadata[tape::END]["dropped"], "0");
-    assert_eq!(contents.metadata[tape::END]["messages"], "600");
+    assert_eq!(contents.metadata[reel::ABOUT]["role"], "test");
+    assert_eq!(contents.metadata[reel::END]["dropped"], "0");
+    assert_eq!(contents.metadata[reel::END]["messages"], "600");
     let mut poses = 0;
     read(&path, |message| {
         if message.topic == "/pose" {
@@ -97,15 +104,15 @@ fn nothing_is_overwritten_and_a_place_that_is_not_there_is_named() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.mcap");
     std::fs::write(&path, "precious").unwrap();
-    let refused = Recording::start(&path, about(), write, |_| ()).unwrap_err();
+    let refused = Recording::start(into(&path), about(), write, |_| ()).unwrap_err();
     assert!(matches!(refused, RecordError::Exists { .. }), "{refused}");
     assert_eq!(std::fs::read(&path).unwrap(), b"precious");
     let wrong = dir.path().join("a.bag");
-    let refused = Recording::start(&wrong, about(), write, |_| ()).unwrap_err();
+    let refused = Recording::start(into(&wrong), about(), write, |_| ()).unwrap_err();
     assert!(refused.to_string().contains("NAME.mcap"), "{refused}");
     assert!(!wrong.exists());
     let nowhere = dir.path().join("no/a.mcap");
-    let refused = Recording::start(&nowhere, about(), write, |_| ()).unwrap_err();
+    let refused = Recording::start(into(&nowhere), about(), write, |_| ()).unwrap_err();
     assert!(matches!(refused, RecordError::Create { .. }), "{refused}");
 }
 
@@ -121,7 +128,8 @@ fn another_clock_begins_another_file_beside() {
         }
         write(tape, ms)
     };
-    let recording = Recording::start(&path, about(), roll, move |o| drop(tx.send(o))).unwrap();
+    let recording =
+        Recording::start(into(&path), about(), roll, move |o| drop(tx.send(o))).unwrap();
     [5000, 5010, 0, 1000]
         .into_iter()
         .for_each(|ms| recording.push(ms));
@@ -136,7 +144,7 @@ fn another_clock_begins_another_file_beside() {
 fn a_file_that_is_cut_off_anywhere_gives_all_that_was_whole() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.mcap");
-    let mut tape = Tape::create(&path, about()).unwrap();
+    let mut tape = Tape::create(Some(&path), None, about()).unwrap();
     for i in 0..300 {
         write(&mut tape, 1000 + 10 * i).unwrap();
         tape.flush(false).unwrap();
