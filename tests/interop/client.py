@@ -115,7 +115,7 @@ class Operator(QuicConnectionProtocol):
 
 
 class Pairing(QuicConnectionProtocol):
-    """An operator's half of a pairing (§14)."""
+    """An end of a pairing (§14): its messages, and an operator's half of what is to be done with them."""
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
@@ -123,6 +123,7 @@ class Pairing(QuicConnectionProtocol):
 
     def quic_event_received(self, event):
         if isinstance(event, events.StreamDataReceived):
+            self.stream = event.stream_id
             self.buffer += event.data
             while (found := pairing.parse(self.buffer)) is not None:
                 message, used = found
@@ -164,9 +165,9 @@ class Pairing(QuicConnectionProtocol):
         return pairing.code(self.exported(), *keys, nonce, revealed)
 
 
-def configured(alpn, key, certificate):
+def configured(alpn, key, certificate, is_client=True):
     configuration = QuicConfiguration(
-        is_client=True, alpn_protocols=[alpn], server_name="telemime", max_datagram_frame_size=65535, idle_timeout=5.0
+        is_client=is_client, alpn_protocols=[alpn], server_name="telemime", max_datagram_frame_size=65535, idle_timeout=5.0
     )
     configuration.certificate, configuration.private_key = certificate, key
     # Names, dates and issuers mean nothing: the pin, or the code that users compare, is what is checked.

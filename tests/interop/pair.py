@@ -1,16 +1,19 @@
 """Pairs a Python operator with `telemime robot` by the code alone, and asserts that whatever differs ends without a pin: a code
-that one user or the other refuses, a key that was not expected, a second attempt, a message out of turn, a session of a stranger.
+that one user or the other refuses, a key that was not expected, a second attempt, a message out of turn, a session of a stranger,
+and somebody in between who hands on every message of `telemime pair`.
 
 Usage: pair.py PROGRAM, where PROGRAM is the `telemime` binary. Needs aioquic; `run` makes the environment.
 """
 
 import asyncio
 import contextlib
+import json
 import pathlib
 import sys
 import tempfile
 
-from client import dial, fingerprint, introduce
+from aioquic.asyncio import serve
+from client import Pairing, configured, dial, fingerprint, introduce
 from drive import Robot, identity
 
 NOT_TRUSTED, DECLINED, OUT_OF_TURN = 5, 4, 7
@@ -120,8 +123,47 @@ async def out_of_turn(program, folder):
             await ended(robot, pairing, OUT_OF_TURN, "a Confirm before all else")
 
 
+async def hand_on(one, other):
+    while "Closed" not in (message := await one.heard.get()):
+        other.say(message)
+
+
+async def in_between(program, folder):
+    """Whoever ends both handshakes makes the codes differ; the robot's, typed at the operator, is a no there."""
+    key, certificate = identity()
+    taken = asyncio.get_running_loop().create_future()
+
+    def take(*args, **kwargs):
+        taken.set_result(Pairing(*args, **kwargs))
+        return taken.result()
+
+    with robot_at(program, folder, "--pair") as robot:
+        configuration = configured("telemime-pair/1", key, certificate, is_client=False)
+        server = await serve("127.0.0.1", 0, configuration=configuration, create_protocol=take)
+        port = server._transport.get_extra_info("sockname")[1]
+        async with introduce(robot.host, robot.port, key, certificate) as towards:
+            operator = await asyncio.create_subprocess_exec(
+                program, "pair", f"127.0.0.1:{port}", "--json", "--identity", f"{folder}/operator.key", "--peer-file",
+                f"{folder}/robots", stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+            )  # fmt: skip
+            between = await asyncio.wait_for(taken, 10)
+            relays = [asyncio.create_task(hand_on(*way)) for way in ((between, towards), (towards, between))]
+            theirs = json.loads(await asyncio.wait_for(operator.stdout.readline(), 10))
+            shown = await robot.tells("pairing", stage="code")
+            assert theirs["event"] == "code" and theirs["code"] != shown["code"], (theirs, shown)
+            print(f"with somebody in between the operator shows {theirs['code']}, the robot {shown['code']}")
+            out, why = await asyncio.wait_for(operator.communicate(shown["code"].encode() + b"\n"), 10)
+            assert operator.returncode == 1 and not out, (operator.returncode, out)
+            await ended(robot, towards, None, "the robot's code typed at that operator")
+            for relay in relays:
+                relay.cancel()
+        server.close()
+        peers = [pathlib.Path(folder) / name for name in ("robots", "peers")]
+        assert not any(path.exists() and fingerprint(certificate) in path.read_text() for path in peers)
+
+
 def main():
-    for play in (by_the_code, another_code, no_at_the_robot, another_key, out_of_turn):
+    for play in (by_the_code, another_code, no_at_the_robot, another_key, out_of_turn, in_between):
         with tempfile.TemporaryDirectory() as folder:
             asyncio.run(play(sys.argv[1], folder))
     print("paired by the code, and by nothing else")
