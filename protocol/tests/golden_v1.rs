@@ -67,6 +67,7 @@ fn operator_control() {
             scale: 0.125,
             rotation: [0.5, -0.5, 0.5, 0.5],
             path_bound_um: 20_000,
+            path_turn_bound_urad: 0,
             sample_us: 33_333,
             lease_ms: 650,
         })

@@ -144,7 +144,7 @@ class Vectors(unittest.TestCase):
 
     def test_paths(self):
         for data, value in self.each("path"):
-            grid = path.Grid(value["path_bound_um"], value["sample_us"])
+            grid = path.Grid(value["path_bound_um"], value["sample_us"], value["path_turn_bound_urad"])
             m = messages.read("operator control", data)["Path"]
             knots = [path.Knot(*k) for k in value["knots"]]
             held, sent = knots[: value["before"]], knots[value["before"] :]

@@ -158,14 +158,16 @@ fn control(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
             scale: 0.125,
             rotation: [0.5, -0.5, 0.5, -0.5],
             path_bound_um: 200,
+            path_turn_bound_urad: 200,
             sample_us: 200,
             lease_ms: 200,
         })
     };
     let play = engage(Drive::Play { plan: 1 }).encode();
-    // From the end: lease 1, samples 1, bound 1, rotation 16, scale 4.
+    // From the end: lease 1, samples 1, both bounds 1, rotation 16, scale 4.
     let from_end = |n| play.len() - n;
-    let (samples, bound, rotation, scale) = (from_end(2), from_end(3), from_end(19), from_end(23));
+    let (samples, turned, bound) = (from_end(2), from_end(3), from_end(4));
+    let (rotation, scale) = (from_end(20), from_end(24));
     let scaled = |v: f32| {
         let mut bytes = play.clone();
         bytes[scale..scale + 4].copy_from_slice(&v.to_le_bytes());
@@ -214,6 +216,17 @@ fn control(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
         OPERATOR_CONTROL,
         "engage, not a rotation",
         with(play.clone(), rotation + 3, 0x40),
+        "Invalid",
+    );
+    say(
+        OPERATOR_CONTROL,
+        "engage, an orientation's path bound above half a turn",
+        [
+            &play[..turned],
+            &codec::encode(&3_141_593_u32),
+            &play[turned + 1..],
+        ]
+        .concat(),
         "Invalid",
     );
     say(
