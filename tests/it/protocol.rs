@@ -112,7 +112,7 @@ fn places() -> [PoseKnot; 3] {
     KNOTS.map(|knot| knot.place().into())
 }
 
-fn turning() -> PathCode {
+fn pose_code() -> PathCode {
     code(Some(0.05))
 }
 
@@ -363,7 +363,7 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
                 engagement: 1,
                 state: STATE,
                 first_knot: 0,
-                knots: KnotBlock::pack(&STATE, turning(), &[], &KNOTS).unwrap(),
+                knots: KnotBlock::pack(&STATE, pose_code(), &[], &KNOTS).unwrap(),
             })),
         ),
         ("reset", message(&OperatorControl::Reset { changes: 9 })),
@@ -631,7 +631,7 @@ fn values() -> BTreeMap<String, String> {
     let jet = path.eval(Stamp(2_500_000_000)).unwrap();
     say("path x(2.5)", vector(&on_path::place(&jet.x)));
     say("path v(2.5)", vector(&on_path::place(&jet.v)));
-    let mut path = PathDecoder::new(turning().grid(), 8);
+    let mut path = PathDecoder::new(pose_code().grid(), 8);
     KNOTS.iter().for_each(|knot| path.append(knot).unwrap());
     let jet = path.eval(Stamp(2_500_000_000)).unwrap();
     let q = on_path::turn(&jet.x).unwrap();

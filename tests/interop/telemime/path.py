@@ -69,17 +69,22 @@ class _Code:
     """What both directions share: columns, and what is expected of a joined knot."""
 
     def __init__(self, grid, before):
-        self.grid, self.columns = grid, [Column(8, 2), Column(0, 2), Column(72, 6), Column(36, 6)]
+        self.grid, self.columns = grid, [Column(8, 2), Column(0, 2)]
+        # Position and tangent; those of an orientation.
+        self.columns += [Column(72, 6), Column(36, 6), Column(72, 6), Column(36, 6)]
         before = before[-MEMORY:]
         for a, b in zip(before, before[1:]):
             if not b.start:
                 self.learn(*self.difference(a, b))
 
     def orders(self):
-        return [c.order() for c in self.columns]
+        """Of samples and jitter; of each position, and of each tangent."""
+        a, b, c, d, e, f = (c.order() for c in self.columns)
+        return a, b, [c] * 3 + [e] * 4, [d] * 3 + [f] * 4
 
     def learn(self, n, late, dx, dv):
-        for column, numbers in zip(self.columns, ([n], [zigzag(late)], map(zigzag, dx), map(zigzag, dv))):
+        dx, dv = [zigzag(n) for n in dx], [zigzag(n) for n in dv]
+        for column, numbers in zip(self.columns, ([n], [zigzag(late)], dx[:3], dv[:3], dx[3:], dv[3:])):
             for number in numbers:
                 column.learn(number)
 
@@ -128,9 +133,9 @@ def decode(state, data, grid, before=()):
             late = r.signed(b)
             dt = grid.ticks(n - 1) + late
             require(1 <= dt < 1 << 31 and grid.samples(dt) == n - 1, "dt", dt)
-            dx = [r.signed(c) for _ in last.x]
+            dx = [r.signed(k) for _, k in zip(last.x, c)]
             x = [e + o for e, o in zip(code.place(last, dt), dx)]
-            dv = [r.signed(d) for _ in last.x]
+            dv = [r.signed(k) for _, k in zip(last.x, d)]
             v = [(e + o) << shift(dt) for e, o in zip(code.tangent(last, x, dt), dv)]
             knot = Knot(last.tick + dt, x, v, False)
             code.learn(n, late, dx, dv)
@@ -162,10 +167,10 @@ def encode(state, knots, grid, before=()):
             n, late, dx, dv = code.difference(known[-1], knot)
             w.golomb(n, a)
             w.signed(late, b)
-            for n_x in dx:
-                w.signed(n_x, c)
-            for n_v in dv:
-                w.signed(n_v, d)
+            for n_x, k in zip(dx, c):
+                w.signed(n_x, k)
+            for n_v, k in zip(dv, d):
+                w.signed(n_v, k)
             code.learn(n, late, dx, dv)
         known.append(knot)
     return w.bytes()

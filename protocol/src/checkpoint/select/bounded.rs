@@ -3,6 +3,7 @@
 use nalgebra::SVector;
 
 use super::super::{CheckpointError, Grid, Plan, check_series};
+use super::cheapen::cheapen;
 use super::search::{Motion, Search};
 
 /// How long to look.
@@ -174,7 +175,8 @@ fn thorough<const D: usize>(
         plan = search.plan(kept)?;
         Ok(())
     })?;
-    verified(plan, motion, bound_m)
+    let cheaper = cheapen(&plan, motion, bound)?;
+    verified(cheaper, motion, bound_m).or_else(|_| verified(plan, motion, bound_m))
 }
 
 /// The search computes in another order than the decoder: it aims this much inside the bound.
