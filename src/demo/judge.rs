@@ -8,8 +8,8 @@ use telemime_operator::cli::Event as Operator;
 use telemime_protocol::checkpoint::path::DecodedKnot;
 use telemime_protocol::spline::HermiteSpan;
 use telemime_protocol::time::Stamp;
-use telemime_robot::daemon::PathPoint as HeldKnot;
 use telemime_robot::cli::Event as Robot;
+use telemime_robot::daemon::PathPoint as HeldKnot;
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo::{Mapping, RAMP_S};
 

@@ -41,9 +41,8 @@ fn run(rig: &Rig, seed: u64) -> Run {
             RobotNotice::Path(path) => Some(path.clone()),
             _ => None,
         });
-        let from_zero = |(t_s, x, v, ..): PathPoint| {
-            (t_s - session_zero.as_secs_f64(), x.into(), v.into())
-        };
+        let from_zero =
+            |(t_s, x, v, ..): PathPoint| (t_s - session_zero.as_secs_f64(), x.into(), v.into());
         Run {
             reports: pair.robot.reports().clone(),
             zero: pair.to_mono(session_zero).0,

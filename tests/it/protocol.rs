@@ -6,9 +6,7 @@ use std::path::Path;
 
 use nalgebra::{SMatrix, SVector, UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
-use telemime_protocol::checkpoint::path::{
-    PathBounds, PathDecoder, PoseKnot, pose as on_path,
-};
+use telemime_protocol::checkpoint::path::{PathBounds, PathDecoder, PoseKnot, pose as on_path};
 use telemime_protocol::checkpoint::{Checkpoint, Grid, Plan, PosePlan};
 use telemime_protocol::pose;
 use telemime_protocol::predict::{
@@ -622,9 +620,7 @@ fn values() -> BTreeMap<String, String> {
 
     let code = code(None);
     let mut path = PathDecoder::new(code.grid(), 8);
-    let knots = motion(None)
-        .knots
-        .unpack(&STATE, code, &[], v1::MAX_KNOTS);
+    let knots = motion(None).knots.unpack(&STATE, code, &[], v1::MAX_KNOTS);
     let knots = knots.unwrap();
     assert_eq!(knots, places()[..2]);
     knots.iter().for_each(|knot| path.append(knot).unwrap());

@@ -186,14 +186,14 @@ fn the_robot_holds_the_path_within_both_bounds() {
         let turn = pose::nearest(&turn.position(into_s).unwrap()).unwrap();
         worst_rad = worst_rad.max(turn.angle_to(&sample.orientation.unwrap()));
     }
-    println!(
-        "{} knots, worst {worst_m} m, {worst_rad} rad",
-        path.len()
-    );
+    println!("{} knots, worst {worst_m} m, {worst_rad} rad", path.len());
     // Stamps are rounded to 10 µs: at 10 m/s and 10 rad/s that is another 0.1 mm and mrad.
     assert!(worst_m <= bound_m + 1e-4, "{worst_m} m");
     assert!(worst_rad <= bound_rad + 1e-4, "{worst_rad} rad");
-    assert!(worst_rad > 0.1 * bound_rad, "it is a curve: {worst_rad} rad");
+    assert!(
+        worst_rad > 0.1 * bound_rad,
+        "it is a curve: {worst_rad} rad"
+    );
 }
 
 #[test]

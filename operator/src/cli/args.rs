@@ -289,9 +289,7 @@ impl Args {
             lease_s: self.lease.unwrap_or(defaults.lease_s),
             future_bound: self.future_bound.unwrap_or(defaults.future_bound),
             path_bound_m: self.path_bound.or(page.then_some(CONSOLE_PATH_BOUND_M)),
-            path_turn_bound_rad: self
-                .path_turn_bound
-                .unwrap_or(defaults.path_turn_bound_rad),
+            path_turn_bound_rad: self.path_turn_bound.unwrap_or(defaults.path_turn_bound_rad),
             input_latency_s: self.input_latency.unwrap_or(0.0),
             glitch_gate: self.glitch_gate,
             gain: self.gain.unwrap_or(defaults.gain),

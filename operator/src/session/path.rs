@@ -186,7 +186,11 @@ impl Path {
         let start = start.unwrap_or(self.unacknowledged.len());
         let mut end = self.unacknowledged.len().min(start + KNOTS_PER_MESSAGE);
         let mut packed = self.packed(state, start, end);
-        while packed.as_ref().is_some_and(|k| k.0.len() > BYTES_PER_MESSAGE) && end > start + 1 {
+        while packed
+            .as_ref()
+            .is_some_and(|k| k.0.len() > BYTES_PER_MESSAGE)
+            && end > start + 1
+        {
             end = start + (end - start) / 2;
             packed = self.packed(state, start, end);
         }

@@ -163,11 +163,7 @@ impl Bench {
     }
 
     /// The same of a hand that has an orientation; the sample.
-    fn turned(
-        &mut self,
-        x: Vector3<f64>,
-        orientation: Option<UnitQuaternion<f64>>,
-    ) -> HandSample {
+    fn turned(&mut self, x: Vector3<f64>, orientation: Option<UnitQuaternion<f64>>) -> HandSample {
         self.idle(33);
         let sample = HandSample {
             orientation,

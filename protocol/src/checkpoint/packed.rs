@@ -168,18 +168,25 @@ pub(super) struct Price<const D: usize> {
 
 impl<const D: usize> Price<D> {
     pub(super) fn of(points: &[Point<D>]) -> Self {
-        Self { columns: columns(points).map(|c| (c.rule, c.order)) }
+        Self {
+            columns: columns(points).map(|c| (c.rule, c.order)),
+        }
     }
 
     /// Of the coordinate `d` of those points whose code depends on the points `j` and `j + 1`.
     pub(super) fn around(&self, points: &[Point<D>], j: usize, d: usize) -> f64 {
         let (rule, order) = self.columns[d];
-        (j.max(1)..points.len().min(j + 4)).map(|i| {
-            let p = &points[i];
-            let off = zigzag(i64::from(p.1[d]) - expected(rule, &points[..i], p.0, d));
-            // Beside the steps of the code, a slope: what leads to fewer bits in the end.
-            golomb_bits(off, order) as f64 + 0.3 * ((off >> order) as f64 + 1.0 + (off as f64)/(1u64<<order) as f64).log2()
-        }).sum()
+        (j.max(1)..points.len().min(j + 4))
+            .map(|i| {
+                let p = &points[i];
+                let off = zigzag(i64::from(p.1[d]) - expected(rule, &points[..i], p.0, d));
+                // Beside the steps of the code, a slope: what leads to fewer bits in the end.
+                golomb_bits(off, order) as f64
+                    + 0.3
+                        * ((off >> order) as f64 + 1.0 + (off as f64) / (1u64 << order) as f64)
+                            .log2()
+            })
+            .sum()
     }
 }
 

@@ -11,9 +11,9 @@ use super::codec::{self, DecodeError};
 use super::frame::MAX_FRAME_LEN;
 use super::knots::KnotBlock;
 pub use super::params::WireParams;
-use crate::checkpoint::path::{MAX_TURN_URAD, PathBounds};
 use super::state::WireState;
 use super::turn::{WirePose, WireRotation};
+use crate::checkpoint::path::{MAX_TURN_URAD, PathBounds};
 
 mod reports;
 pub use reports::{Reception, RobotDatagram, ServoTimes, Telemetry};

@@ -209,7 +209,8 @@ fn a_path_that_no_datagram_delivers_goes_by_the_stream_to_its_last_sample() {
     let path = by_stream(&bench.control, BOUND_M);
     for (t, x) in &samples {
         let tick = Stamp(tick_of(*t) * TICK_NS);
-        let error_m = (on_path::place(&path.eval(tick).expect("no hole, to the last").x) - x).norm();
+        let error_m =
+            (on_path::place(&path.eval(tick).expect("no hole, to the last").x) - x).norm();
         assert!(error_m <= BOUND_M, "{error_m} m off");
     }
 }

@@ -382,10 +382,7 @@ fn read<const D: usize>(
         numbers.x[d] = r.golomb(order[group(d)]).ok_or(truncated.clone())?;
         x[d] = in_range(expected + unzigzag(numbers.x[d]))?;
     }
-    let (order, shift) = (
-        orders(&model.tangents),
-        PathGrid::<D>::slope_shift(ticks),
-    );
+    let (order, shift) = (orders(&model.tangents), PathGrid::<D>::slope_shift(ticks));
     for (d, expected) in expected_v(a, &x, ticks).into_iter().enumerate() {
         numbers.v[d] = r.golomb(order[group(d)]).ok_or(truncated.clone())?;
         v[d] = in_range((expected + unzigzag(numbers.v[d])) << shift)?;

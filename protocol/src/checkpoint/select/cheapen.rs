@@ -42,7 +42,11 @@ pub(super) fn cheapen<const D: usize>(
     }
     let room = |e2: f64| {
         let share = e2 / (bound * bound);
-        if share > 1.0 { f64::INFINITY } else { share.powi(8) }
+        if share > 1.0 {
+            f64::INFINITY
+        } else {
+            share.powi(8)
+        }
     };
     let mut spent: f64 = errors.iter().map(|e| room(e.norm_squared())).sum();
     if !spent.is_finite() {
@@ -53,7 +57,16 @@ pub(super) fn cheapen<const D: usize>(
         let mut moved = false;
         for j in 0..count {
             for d in 0..D {
-                for (here, next) in [(1, 0), (-1, 0), (2, 0), (-2, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)] {
+                for (here, next) in [
+                    (1, 0),
+                    (-1, 0),
+                    (2, 0),
+                    (-2, 0),
+                    (1, 1),
+                    (-1, -1),
+                    (1, -1),
+                    (-1, 1),
+                ] {
                     if next != 0 && j + 1 == count {
                         continue;
                     }
