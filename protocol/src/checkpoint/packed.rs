@@ -161,7 +161,8 @@ pub(super) fn pack<const D: usize>(grid: Grid, points: &[Point<D>]) -> Vec<u8> {
     w.finish()
 }
 
-/// What values cost, near enough to compare: with the rules and orders that were best for some points.
+/// What values cost with the rules and orders that are best for some points, and a little more for what is far off:
+/// what leads to fewer bits in the end.
 pub(super) struct Price<const D: usize> {
     columns: [(Rule, u32); D],
 }
@@ -173,20 +174,16 @@ impl<const D: usize> Price<D> {
         }
     }
 
-    /// Of the coordinate `d` of those points whose code depends on the points `j` and `j + 1`.
+    /// Bits of the coordinate `d` of those points whose code depends on the points `j` and `j + 1`.
     pub(super) fn around(&self, points: &[Point<D>], j: usize, d: usize) -> f64 {
         let (rule, order) = self.columns[d];
-        (j.max(1)..points.len().min(j + 4))
-            .map(|i| {
-                let p = &points[i];
-                let off = zigzag(i64::from(p.1[d]) - expected(rule, &points[..i], p.0, d));
-                // Beside the steps of the code, a slope: what leads to fewer bits in the end.
-                golomb_bits(off, order) as f64
-                    + 0.3
-                        * ((off >> order) as f64 + 1.0 + (off as f64) / (1u64 << order) as f64)
-                            .log2()
-            })
-            .sum()
+        let bits = |i: usize| {
+            let p = &points[i];
+            let off = zigzag(i64::from(p.1[d]) - expected(rule, &points[..i], p.0, d));
+            let unit = (1_u64 << order) as f64;
+            golomb_bits(off, order) as f64 + 0.3 * libm::log2(1.0 + 2.0 * off as f64 / unit)
+        };
+        (j.max(1)..points.len().min(j + 4)).map(bits).sum()
     }
 }
 

@@ -14,7 +14,8 @@ pub enum Effort {
     /// Then fewer equal shares of the curvature, off the curve, and those left out that are not needed: less than a
     /// millisecond for 300 samples.
     Brisk,
-    /// Then fewer, moved, off the curve where that helps, on coarser grids: tenths of a second.
+    /// Then fewer, moved, off the curve where that helps, on coarser grids, at values that are cheap to write: tenths of
+    /// a second.
     Thorough,
 }
 
