@@ -209,7 +209,7 @@ mod tests {
 
     #[test]
     fn what_is_beyond_the_bound_is_left_as_it_is() {
-        let (t, y) = ([0.0, 0.5, 1.0], [0.0, 1.0, 0.0].map(Vector3::repeat));
+        let (t, y) = ([0.0, 0.5, 1.0], [0.0, 1.01, 0.0].map(Vector3::repeat));
         let plan = bounded_with(&t, &y, 0.1, Effort::Quick).unwrap();
         let motion = Motion::new(&t, &y);
         assert_eq!(cheapen(&plan, &motion, 1e-6).unwrap(), plan);
