@@ -210,7 +210,7 @@ fn prediction(
                 }
             }
         }
-        Method::Hold | Method::Velocity | Method::Kalman => {
+        Method::Hold | Method::Velocity(_) | Method::Kalman => {
             let mut sender = Sender::new(settings.method, &subject.kalman);
             for sample in d.samples() {
                 if let Some(message) = sender.take(sample) {

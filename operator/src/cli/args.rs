@@ -12,7 +12,7 @@ use telemime_endpoint::{cli, logs};
 use super::input::InputArgs;
 use crate::console::Shape;
 use crate::placed::Placed;
-use crate::session::{FutureBound, SessionConfig};
+use crate::session::{FutureBound, MAX_LEASE_S, MAX_SILENCE_S, SessionConfig};
 
 /// Teach, drive and play a robot.
 ///
@@ -223,12 +223,6 @@ impl Axes {
     }
 }
 
-/// Longest silence that still lets the arm follow at full speed: the robot coasts after 0.26 s.
-const MAX_SILENCE_S: f64 = 0.25;
-
-/// Longest lease the robot grants, s.
-const MAX_LEASE_S: f64 = 1.0;
-
 pub(super) fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
     let wrong = || {
         format!("`{text}`: write a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)")
@@ -310,6 +304,12 @@ impl Args {
         )?;
         within("--hand-sigma", config.hand_sigma_m, 0.0, 1.0)?;
         within("--gain", config.gain, -f64::EPSILON, 1.0)?;
+        if let Some(rest_s) = self.rest {
+            within("--rest", rest_s, -f64::EPSILON, 60.0)?;
+        }
+        if let Some(patience_s) = self.patience {
+            within("--patience", patience_s, 0.0, 3600.0)?;
+        }
         if let Some(scale) = config.scale {
             within("--scale", scale, 0.0, 10.0)?;
         }

@@ -213,6 +213,16 @@ impl Settings for Args {
             (self.learn, self.skill) = (file.learn, file.skills);
         }
         self.matching = self.matching.or(file.matching);
+        let tasks = [
+            ("replay", file.replay.is_some()),
+            ("play", file.play.is_some()),
+            ("console", file.console.is_some()),
+            ("[input] source", file.input.source.is_some()),
+        ];
+        let mut named = tasks.iter().filter(|(_, named)| *named);
+        if let (Some((one, _)), Some((other, _))) = (named.next(), named.next()) {
+            anyhow::bail!("{one} and {other} are two tasks: an operator has one");
+        }
         let free = self.replay.is_empty() && self.play.is_none() && self.console.is_none();
         if free && self.input.input.is_none() {
             self.replay = file.replay.map_or_else(Vec::new, Vec::from);

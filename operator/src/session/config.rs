@@ -15,6 +15,12 @@ pub enum FutureBound {
     Relative(f64),
 }
 
+/// Longest silence that still lets the arm follow at full speed, s: the robot coasts after 0.26 s.
+pub const MAX_SILENCE_S: f64 = 0.25;
+
+/// Longest lease the robot grants, s.
+pub const MAX_LEASE_S: f64 = 1.0;
+
 /// What a session is set to.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SessionConfig {
