@@ -19,6 +19,7 @@ mod gating;
 mod mirroring;
 mod posing;
 mod resting;
+mod trusting;
 
 const MS: i64 = 1_000_000;
 const EPOCH: u32 = 17;

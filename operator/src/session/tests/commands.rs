@@ -169,9 +169,10 @@ fn what_a_declined_request_took_is_not_counted() {
     bench.session.engage(bench.now);
     for i in 0..10 {
         bench.now.0 += 33 * MS;
+        let x = home() + Vector3::x() * 0.1 * f64::from((i - 6).max(0));
         let sample = HandSample {
             resting: i < 7,
-            ..HandSample::at(bench.now, home())
+            ..HandSample::at(bench.now, x)
         };
         bench.session.handle_sample(bench.now, sample);
     }
