@@ -408,14 +408,9 @@ const DELAY_S: f64 = 0.1;
 
 impl Guarded {
     fn new(side: Side, skill: &Arc<Skill>, session: &SessionConfig) -> Self {
-        let config = SessionConfig {
-            max_silence_s: 0.0,
-            min_interval_s: 0.0,
-            ..*session
-        };
         Self {
             side,
-            session: Live::new(skill, config, DELAY_S),
+            session: Live::of_every_sample(skill, *session, DELAY_S),
             said: None,
             newest: None,
         }

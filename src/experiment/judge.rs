@@ -168,7 +168,8 @@ fn wire(figures: &mut Figures, trace: &Trace, end_s: f64) {
     }
 }
 
-/// What the operator predicts from each sample (ours: from each message), without network and arm.
+/// What the operator predicts from each sample, without network and arm. Ours from each sample too, not only from those it
+/// speaks of: it speaks when a prediction has failed, so that its messages are a choice of the hard moments.
 fn prediction(
     figures: &mut Figures,
     settings: &Settings,
@@ -197,9 +198,9 @@ fn prediction(
                 input_latency_s: 0.0,
                 ..session(settings, axes)
             };
-            let mut live = Live::new(&subject.skill, config, 0.0);
+            let mut live = Live::of_every_sample(&subject.skill, config, 0.0);
             for sample in d.samples() {
-                for said in live.take(sample) {
+                if let Some(said) = live.take(sample).pop() {
                     let since_s = said.place.t.secs_since(on_session_clock(0.0));
                     judge(since_s, &|h_s| {
                         let seen = said.place.at(h_s);

@@ -231,7 +231,9 @@ const MAX_LEASE_S: f64 = 1.0;
 
 pub(super) fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
     let wrong = || {
-        format!("`{text}`: write a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)")
+        format!(
+            "`{text}`: write a share of the way (0.3way), a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)"
+        )
     };
     let number = |digits: &str| {
         digits
@@ -243,6 +245,8 @@ pub(super) fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
     };
     if let Some(digits) = text.strip_suffix("sigma") {
         Ok(FutureBound::Relative(number(digits)?))
+    } else if let Some(digits) = text.strip_suffix("way") {
+        Ok(FutureBound::Share(number(digits)?))
     } else if let Some(digits) = text.strip_suffix("mm") {
         Ok(FutureBound::Absolute(number(digits)? * 1e-3))
     } else if let Some(digits) = text.strip_suffix('m') {
@@ -342,7 +346,8 @@ mod tests {
             parse_future_bound("0.6sigma"),
             Ok(FutureBound::Relative(0.6))
         );
-        for bad in ["", "40", "mm", "-1mm", "nanmm", "infsigma"] {
+        assert_eq!(parse_future_bound("0.3 way"), Ok(FutureBound::Share(0.3)));
+        for bad in ["", "40", "mm", "-1mm", "nanmm", "infsigma", "way", "-1way"] {
             assert!(parse_future_bound(bad).is_err(), "{bad}");
         }
     }

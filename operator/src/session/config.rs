@@ -13,6 +13,9 @@ pub enum FutureBound {
     Absolute(f64),
     /// A multiple of the predicted standard deviation.
     Relative(f64),
+    /// A share of the way the hand usually goes from a sample until its message takes effect, as the skill's
+    /// demonstrations have it (root mean square); without a skill half a metre a second along each axis is taken for usual.
+    Share(f64),
 }
 
 /// What a session is set to.
