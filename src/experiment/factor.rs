@@ -83,8 +83,8 @@ pub(super) const FACTORS: [Factor; 16] = [
     ),
     factor(
         "future",
-        &["1 sigma"],
-        "bound on the future: a distance, or sigmas of what is predicted",
+        &["0.3 way"],
+        "bound on the future: a share of the way the hand usually goes, a distance, or sigmas of what is predicted",
         OURS,
     ),
     factor("path", &["auto"], "bound on the path, a distance", OURS),

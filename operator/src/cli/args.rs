@@ -118,8 +118,9 @@ pub struct Args {
     /// Prediction gain, 0 (none) to 1.
     #[arg(long)]
     pub gain: Option<f64>,
-    /// ε_future: when the robot's prediction would be off by more, the operator speaks; a length (40mm, 0.04m) or a
-    /// multiple of the predicted deviation (0.6sigma) [default: 1sigma].
+    /// ε_future: when the robot's prediction would be off by more, the operator speaks; a share of the way the hand
+    /// usually goes until a message takes effect (0.3way), a length (40mm, 0.04m) or a multiple of the predicted deviation
+    /// (0.6sigma) [default: 0.3way].
     #[arg(long, value_name = "BOUND", value_parser = parse_future_bound)]
     pub future_bound: Option<FutureBound>,
     /// ε_path, m: the robot's record of the path is that exact [default: 2 % of the skill's reach].

@@ -54,7 +54,7 @@ impl Default for SessionConfig {
             max_silence_s: 0.2,
             min_interval_s: 0.01,
             lease_s: 0.65,
-            future_bound: FutureBound::Relative(1.0),
+            future_bound: FutureBound::Share(0.3),
             path_bound_m: None,
             input_latency_s: 0.0,
             glitch_gate: false,

@@ -99,7 +99,7 @@ fn what_a_declined_request_took_is_not_counted() {
         bench.now.0 += 33 * MS;
         let sample = HandSample {
             resting: i < 7,
-            ..HandSample::at(bench.now, home())
+            ..HandSample::at(bench.now, home() * f64::from(1 + i / 7))
         };
         bench.session.handle_sample(bench.now, sample);
     }

@@ -49,6 +49,24 @@ fn a_hand_that_only_turns_or_grips_is_told_of() {
 }
 
 #[test]
+fn an_orientation_has_a_way_of_its_own() {
+    let said = |share| {
+        let config = SessionConfig {
+            future_bound: FutureBound::Share(share),
+            ..SessionConfig::default()
+        };
+        let mut bench = Bench::engaged(config, Some(posed_example(2, 24)));
+        for i in 0..90 {
+            let angle = 0.3 * (0.3 * f64::from(i)).sin();
+            pose(&mut bench, Some(Vector3::z() * angle), None);
+        }
+        bench.motions().len()
+    };
+    let (fine, usual, wide) = (said(0.1), said(0.3), said(10.0));
+    assert!(fine > usual && usual > wide, "{fine} {usual} {wide}");
+}
+
+#[test]
 fn what_the_tracker_loses_is_held_and_what_is_no_orientation_is_not_taken() {
     let mut bench = engaged(None);
     let turn = Vector3::new(0.3, -0.2, 0.1);
