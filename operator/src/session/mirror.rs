@@ -36,6 +36,10 @@ const LEAST_FUTURE_BOUND_RAD: f64 = 5e-3;
 /// Where the future's bound says nothing of orientations, they may be off by this multiple of their deviation.
 const TURN_SIGMAS: f64 = 0.6;
 
+/// Most of how a hand that is led with care turns is the tracker's tremble: a share of that way is no finer than this multiple
+/// of what a prediction errs by anyway, or every sample would be news.
+const TREMBLE_SIGMAS: f64 = 1.5;
+
 /// A gripper is told of changes above this, in steps of 1/255.
 const GRIP_STEPS: u8 = 4;
 
@@ -343,7 +347,8 @@ impl Mirror {
                 let bound_rad = match (bound, &self.usual.1) {
                     (FutureBound::Relative(sigmas), _) => sigmas * known.sigma_rad,
                     (FutureBound::Share(share), Some(usual)) => {
-                        share * usual.in_s(ahead_s(newest.t))
+                        let way = share * usual.in_s(ahead_s(newest.t));
+                        way.max(TREMBLE_SIGMAS * known.sigma_rad)
                     }
                     (FutureBound::Absolute(_) | FutureBound::Share(_), _) => {
                         TURN_SIGMAS * known.sigma_rad
