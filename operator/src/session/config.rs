@@ -14,7 +14,8 @@ pub enum FutureBound {
     /// A multiple of the predicted standard deviation.
     Relative(f64),
     /// A share of the way the hand usually goes from a sample until its message takes effect, as the skill's
-    /// demonstrations have it (root mean square); without a skill half a metre a second along each axis is taken for usual.
+    /// demonstrations have it (root mean square), but at most two predicted deviations; without a skill half a metre a second
+    /// along each axis is taken for usual.
     Share(f64),
 }
 

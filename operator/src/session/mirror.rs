@@ -36,6 +36,10 @@ const LEAST_FUTURE_BOUND_RAD: f64 = 5e-3;
 /// Where the future's bound says nothing of orientations, they may be off by this multiple of their deviation.
 const TURN_SIGMAS: f64 = 0.6;
 
+/// A share of the way is never more than this multiple of the predicted deviation: where much better can be foretold, the robot is
+/// to have it.
+const EXACT_SIGMAS: f64 = 2.0;
+
 /// Most of how a hand that is led with care turns is the tracker's tremble: a share of that way is no finer than this multiple
 /// of what a prediction errs by anyway, or every sample would be news.
 const TREMBLE_SIGMAS: f64 = 1.5;
@@ -336,7 +340,10 @@ impl Mirror {
         let bound_m = match bound {
             FutureBound::Absolute(bound_m) => bound_m,
             FutureBound::Relative(sigmas) => sigmas * known.sigma_m,
-            FutureBound::Share(share) => share * self.usual.0.in_s(ahead_s(newest.place.t)),
+            FutureBound::Share(share) => {
+                let way_m = self.usual.0.in_s(ahead_s(newest.place.t));
+                (share * way_m).min(EXACT_SIGMAS * known.sigma_m)
+            }
         };
         if (held.position - known.position).norm() > bound_m.max(LEAST_FUTURE_BOUND_M) {
             return true;
