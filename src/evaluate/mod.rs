@@ -38,7 +38,7 @@ const BOUNDS: [f64; 6] = [0.04, 0.08, 0.16, 0.32, 0.48, 0.64];
 
 /// … as multiples of the predicted deviation, and as shares of the way the hand usually goes.
 const SIGMAS: [f64; 4] = [0.6, 1.0, 1.5, 2.0];
-const SHARES: [f64; 6] = [0.15, 0.2, 0.3, 0.4, 0.5, 0.6];
+const SHARES: [f64; 5] = [0.15, 0.2, 0.3, 0.45, 0.6];
 
 /// Largest silences that are tried, s.
 const SILENCES_S: [Option<f64>; 3] = [Some(0.2), Some(0.3), None];

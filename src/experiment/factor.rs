@@ -83,7 +83,7 @@ pub(super) const FACTORS: [Factor; 16] = [
     ),
     factor(
         "future",
-        &["0.3 way"],
+        &["0.2 way"],
         "bound on the future: a share of the way the hand usually goes, a distance, or sigmas of what is predicted",
         OURS,
     ),
@@ -248,7 +248,7 @@ fn future(text: &str) -> Result<FutureBound, String> {
     } else {
         distance_m(text)
             .map(FutureBound::Absolute)
-            .map_err(|_| "write `0.3 way`, `1 sigma` or a distance, for example 20mm".into())
+            .map_err(|_| "write `0.2 way`, `1 sigma` or a distance, for example 20mm".into())
     }
 }
 

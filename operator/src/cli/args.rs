@@ -119,8 +119,8 @@ pub struct Args {
     #[arg(long)]
     pub gain: Option<f64>,
     /// ε_future: when the robot's prediction would be off by more, the operator speaks; a share of the way the hand
-    /// usually goes until a message takes effect (0.3way), a length (40mm, 0.04m) or a multiple of the predicted deviation
-    /// (0.6sigma) [default: 0.3way].
+    /// usually goes until a message takes effect (0.2way), a length (40mm, 0.04m) or a multiple of the predicted deviation
+    /// (0.6sigma) [default: 0.2way].
     #[arg(long, value_name = "BOUND", value_parser = parse_future_bound)]
     pub future_bound: Option<FutureBound>,
     /// ε_path, m: the robot's record of the path is that exact [default: 2 % of the skill's reach].
@@ -233,7 +233,7 @@ const MAX_LEASE_S: f64 = 1.0;
 pub(super) fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
     let wrong = || {
         format!(
-            "`{text}`: write a share of the way (0.3way), a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)"
+            "`{text}`: write a share of the way (0.2way), a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)"
         )
     };
     let number = |digits: &str| {
@@ -347,7 +347,7 @@ mod tests {
             parse_future_bound("0.6sigma"),
             Ok(FutureBound::Relative(0.6))
         );
-        assert_eq!(parse_future_bound("0.3 way"), Ok(FutureBound::Share(0.3)));
+        assert_eq!(parse_future_bound("0.2 way"), Ok(FutureBound::Share(0.2)));
         for bad in ["", "40", "mm", "-1mm", "nanmm", "infsigma", "way", "-1way"] {
             assert!(parse_future_bound(bad).is_err(), "{bad}");
         }

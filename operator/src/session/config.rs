@@ -55,7 +55,7 @@ impl Default for SessionConfig {
             max_silence_s: 0.2,
             min_interval_s: 0.01,
             lease_s: 0.65,
-            future_bound: FutureBound::Share(0.3),
+            future_bound: FutureBound::Share(0.2),
             path_bound_m: None,
             input_latency_s: 0.0,
             glitch_gate: false,
