@@ -49,10 +49,10 @@ fn a_hand_that_only_turns_or_grips_is_told_of() {
 }
 
 #[test]
-fn an_orientation_has_a_way_of_its_own() {
-    let said = |share| {
+fn an_orientation_has_a_way_of_its_own_no_finer_than_what_is_predicted() {
+    let said = |future_bound| {
         let config = SessionConfig {
-            future_bound: FutureBound::Share(share),
+            future_bound,
             ..SessionConfig::default()
         };
         let mut bench = Bench::engaged(config, Some(posed_example(2, 24)));
@@ -60,10 +60,14 @@ fn an_orientation_has_a_way_of_its_own() {
             let angle = 0.3 * (0.3 * f64::from(i)).sin();
             pose(&mut bench, Some(Vector3::z() * angle), None);
         }
-        bench.motions().len()
+        bench.datagrams
     };
-    let (fine, usual, wide) = (said(0.1), said(0.3), said(10.0));
-    assert!(fine > usual && usual > wide, "{fine} {usual} {wide}");
+    let (fine, wide) = (
+        said(FutureBound::Share(0.01)),
+        said(FutureBound::Share(10.0)),
+    );
+    assert_eq!(fine, said(FutureBound::Relative(1.5)));
+    assert!(fine.len() > 2 * wide.len(), "{} {}", fine.len(), wide.len());
 }
 
 #[test]
