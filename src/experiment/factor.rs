@@ -83,8 +83,8 @@ pub(super) const FACTORS: [Factor; 16] = [
     ),
     factor(
         "future",
-        &["1 sigma"],
-        "bound on the future: a distance, or sigmas of what is predicted",
+        &["0.2 way"],
+        "bound on the future: a share of the way the hand usually goes, a distance, or sigmas of what is predicted",
         OURS,
     ),
     factor("path", &["auto"], "bound on the path, a distance", OURS),
@@ -252,14 +252,15 @@ fn auto<T>(text: &str, read: impl Fn(&str) -> Result<T, String>) -> Result<Optio
 }
 
 fn future(text: &str) -> Result<FutureBound, String> {
-    match text.strip_suffix("sigma") {
-        Some(n) => {
-            let n = within(number(n)?, 0.01, 100.0, "0.01 to 100 sigma")?;
-            Ok(FutureBound::Relative(n))
-        }
-        None => distance_m(text)
+    let times = |n: &str, what| within(number(n)?, 0.01, 100.0, what);
+    if let Some(n) = text.strip_suffix("way") {
+        times(n, "0.01 to 100 way").map(FutureBound::Share)
+    } else if let Some(n) = text.strip_suffix("sigma") {
+        times(n, "0.01 to 100 sigma").map(FutureBound::Relative)
+    } else {
+        distance_m(text)
             .map(FutureBound::Absolute)
-            .map_err(|_| "write `1 sigma` or a distance, for example 20mm".into()),
+            .map_err(|_| "write `0.2 way`, `1 sigma` or a distance, for example 20mm".into())
     }
 }
 

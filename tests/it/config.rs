@@ -84,7 +84,7 @@ fn values() -> BTreeMap<&'static str, [&'static str; 3]> {
         ("scale", ["0.1", "0.2", "0.3"]),
         ("axes", ["\"kinect\"", "base", "kinect"]),
         ("gain", ["0.1", "0.2", "0.3"]),
-        ("future_bound", ["\"10mm\"", "20mm", "2sigma"]),
+        ("future_bound", ["\"10mm\"", "20mm", "0.4way"]),
         ("path_bound_m", ["0.01", "0.02", "0.03"]),
         ("max_silence_s", ["0.1", "0.15", "0.2"]),
         ("min_interval_s", ["0.01", "0.02", "0.03"]),

@@ -118,8 +118,9 @@ pub struct Args {
     /// Prediction gain, 0 (none) to 1.
     #[arg(long)]
     pub gain: Option<f64>,
-    /// ε_future: when the robot's prediction would be off by more, the operator speaks; a length (40mm, 0.04m) or a
-    /// multiple of the predicted deviation (0.6sigma) [default: 1sigma].
+    /// ε_future: when the robot's prediction would be off by more, the operator speaks; a share of the way the hand
+    /// usually goes until a message takes effect (0.2way), a length (40mm, 0.04m) or a multiple of the predicted deviation
+    /// (0.6sigma) [default: 0.2way].
     #[arg(long, value_name = "BOUND", value_parser = parse_future_bound)]
     pub future_bound: Option<FutureBound>,
     /// ε_path, m: the robot's record of the path is that exact [default: 2 % of the skill's reach].
@@ -225,7 +226,9 @@ impl Axes {
 
 pub(super) fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
     let wrong = || {
-        format!("`{text}`: write a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)")
+        format!(
+            "`{text}`: write a share of the way (0.2way), a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)"
+        )
     };
     let number = |digits: &str| {
         digits
@@ -237,6 +240,8 @@ pub(super) fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
     };
     if let Some(digits) = text.strip_suffix("sigma") {
         Ok(FutureBound::Relative(number(digits)?))
+    } else if let Some(digits) = text.strip_suffix("way") {
+        Ok(FutureBound::Share(number(digits)?))
     } else if let Some(digits) = text.strip_suffix("mm") {
         Ok(FutureBound::Absolute(number(digits)? * 1e-3))
     } else if let Some(digits) = text.strip_suffix('m') {
@@ -342,7 +347,8 @@ mod tests {
             parse_future_bound("0.6sigma"),
             Ok(FutureBound::Relative(0.6))
         );
-        for bad in ["", "40", "mm", "-1mm", "nanmm", "infsigma"] {
+        assert_eq!(parse_future_bound("0.2 way"), Ok(FutureBound::Share(0.2)));
+        for bad in ["", "40", "mm", "-1mm", "nanmm", "infsigma", "way", "-1way"] {
             assert!(parse_future_bound(bad).is_err(), "{bad}");
         }
     }

@@ -138,7 +138,7 @@ impl Settings for Args {
                     "\"kinect\"",
                 ),
                 new("gain", "gain", Kind::Number, "1.0").or(session.gain),
-                new("future_bound", "future-bound", Kind::Text, "\"1sigma\"").or("1sigma"),
+                new("future_bound", "future-bound", Kind::Text, "\"0.2way\"").or("0.2way"),
                 new("path_bound_m", "path-bound", Kind::Number, "0.01"),
                 new("max_silence_s", "max-silence", Kind::Number, "0.2").or(session.max_silence_s),
                 new("min_interval_s", "min-interval", Kind::Number, "0.01")

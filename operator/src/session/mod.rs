@@ -15,6 +15,7 @@ mod pace;
 mod said;
 #[cfg(test)]
 mod tests;
+mod usual;
 mod view;
 
 use std::collections::VecDeque;
