@@ -6,6 +6,7 @@
 //!
 //! - the robot's address for `robot.example:4433` and the other names it has, and a free port for what the text listens at;
 //! - for the public recordings a few files of a few folders of each set, because they are many (`data`; without them, skipped and said);
+//! - for a ready plan's people one of them (`experiment quick`);
 //! - for what builds this program a look whether what is named exists (`cargo …`).
 //!
 //! What takes a program that this host lacks is skipped and said; [`NEVER`] is all that is never tried.
@@ -25,7 +26,14 @@ use text::{blocks, commands_elsewhere, documents, read, spans};
 const EVENING: [&str; 5] = ["start", "teaching", "hosts", "compare", "experiments"];
 
 /// After the README, with recordings at hand.
-const AT_WORK: [&str; 6] = ["console", "input", "recordings", "driver", "arm", "operations"];
+const AT_WORK: [&str; 6] = [
+    "console",
+    "input",
+    "recordings",
+    "driver",
+    "arm",
+    "operations",
+];
 
 /// What is looked up and measured.
 const MEASURED: [&str; 5] = ["commands", "codec", "recognition", "prediction", "paper"];
@@ -111,7 +119,10 @@ fn the_books_commands_do_what_it_says() {
     let mut found = never.clone();
     found.sort_unstable();
     assert_eq!(found, all, "what is never run is stated here");
-    println!("{ran} lines run, {checked} of cargo's looked at, {} never", never.len());
+    println!(
+        "{ran} lines run, {checked} of cargo's looked at, {} never",
+        never.len()
+    );
     assert!(ran > 80, "{ran}");
 }
 
@@ -134,7 +145,10 @@ fn no_command_stands_where_nobody_runs_it() {
         let typed: usize = blocks(&text).iter().map(|block| block.lines.len()).sum();
         assert!(typed == 0 || run.contains(&document), "{document}");
         let loose = commands_elsewhere(&text);
-        assert!(loose.is_empty(), "{document}: not in a block `sh`: {loose:?}");
+        assert!(
+            loose.is_empty(),
+            "{document}: not in a block `sh`: {loose:?}"
+        );
     }
 }
 
@@ -146,7 +160,8 @@ fn what_cargo_is_told_in_passing_exists() {
     for document in documents() {
         for span in spans(&read(&document)) {
             let command = span.split_once("cargo ").map(|(_, rest)| rest);
-            if let Some(rest) = command.filter(|rest| rest.contains(" --") || rest.contains("-p ")) {
+            if let Some(rest) = command.filter(|rest| rest.contains(" --") || rest.contains("-p "))
+            {
                 let line = format!("cargo {rest}");
                 assert_eq!(cargo_has(&line, &tests), Ok(()), "{document}: {span}");
                 seen += 1;
@@ -161,7 +176,11 @@ fn command_lines(text: &str) -> Vec<String> {
     let lines = blocks(text).into_iter().flat_map(|block| block.lines);
     let mentioned = spans(text).into_iter().filter(|span| {
         let placeholder = |c: char| c.is_ascii_uppercase() || "…|[".contains(c);
-        span.split(' ').count() > 2 && !span.contains(placeholder)
+        let whole = !span
+            .rsplit(' ')
+            .next()
+            .is_some_and(|last| last.starts_with('-'));
+        whole && span.split(' ').count() > 2 && !span.contains(placeholder)
     });
     let mut found = Vec::new();
     for line in lines.chain(mentioned) {
@@ -186,7 +205,10 @@ fn every_command_line_in_the_documents_is_one() {
             let line = line.replacen("telemime", "\"$PROGRAM\"", 1);
             // A relay asks at once for whom it is.
             let line = line.replace("robot.example:", "127.0.0.1:");
-            let script = line.replace("--to robot:", "--to 127.0.0.1:") + " --help";
+            let line = line.replace("--to robot:", "--to 127.0.0.1:");
+            // What comes after `--` is another's.
+            let line = line.split(" -- ").next().unwrap();
+            let script = format!("{line} --help");
             let out = Command::new("sh")
                 .args(["-fc", &script])
                 .env("PROGRAM", program)

@@ -265,9 +265,7 @@ impl ControllerState {
             ..Self::default()
         }
     }
-}
 
-impl ControllerState {
     /// A copy with as much room for setpoints.
     pub(crate) fn roomy_clone(&self) -> Self {
         let mut setpoints = Vec::with_capacity(self.setpoints.capacity());

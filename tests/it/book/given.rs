@@ -24,7 +24,9 @@ fn recording(path: &Path, samples: Vec<(f64, [f64; 3])>) {
         .into_iter()
         .map(|(t_s, x)| Sample::at(t_s, Vector3::from(x)))
         .collect();
-    let text = Demonstration::from_samples(path, &samples).unwrap().to_csv();
+    let text = Demonstration::from_samples(path, &samples)
+        .unwrap()
+        .to_csv();
     fs::write(path, text).unwrap();
 }
 
@@ -53,7 +55,10 @@ pub(super) fn give(dir: &Path) {
     for index in 0..3 {
         recording(&dir.join(format!("wave/{index}.csv")), swing(3, index));
         let goal = [0.3, 0.05 * f64::from(index), 1.9];
-        recording(&dir.join(format!("pour/{index}.csv")), reach(1, index, goal));
+        recording(
+            &dir.join(format!("pour/{index}.csv")),
+            reach(1, index, goal),
+        );
     }
     recording(&dir.join("unseen.csv"), swing(3, 5));
     recording(&dir.join("new.csv"), swing(3, 6));
@@ -65,7 +70,7 @@ pub(super) fn give(dir: &Path) {
     fs::write(dir.join("my_arm.urdf"), arm.replace("\"tcp\"", "\"tool0\"")).unwrap();
     let (samples, pressed) = taps(1, 12);
     recording(&dir.join("taps.csv"), samples);
-    let pressed: Vec<_> = pressed.iter().map(|t| format!("{:.4}", t + 0.08)).collect();
+    let pressed: Vec<_> = pressed.iter().map(|t| format!("{:.4}", t - 0.08)).collect();
     fs::write(dir.join("presses.txt"), pressed.join("\n")).unwrap();
     symlink(root().join("docs"), dir.join("docs")).unwrap();
     let learned = Command::new(program())
@@ -86,7 +91,7 @@ fn children(folder: &Path) -> Vec<PathBuf> {
 
 /// `data/`: links to a few of the public recordings, and to the publication's series, where they are at hand.
 fn recorded(dir: &Path) {
-    let all = data();
+    let all = data().join("data");
     if !all.join("demos").is_dir() {
         return;
     }

@@ -212,9 +212,11 @@ impl Reader {
         Running { child, said }
     }
 
-    /// With the robot's address, and no port that may be taken.
+    /// With the robot's address, no port that may be taken, and no more than one person of an experiment's plan.
     fn here(&self, line: &str) -> String {
         let mut line = format!("{line} ").replace("--listen 0.0.0.0:5000", "--listen 127.0.0.1:0");
+        // One person of the plan's.
+        line = line.replace("experiment quick ", "experiment quick --people 1 ");
         for name in ROBOT {
             let flag = name.split_once(' ').map_or("", |(flag, _)| flag);
             line = line.replace(name, &format!("{flag} {} ", self.addr));
@@ -341,4 +343,3 @@ pub(super) fn skipped(what: &str, why: &str) {
     // Straight to stderr: what a passing test prints by `eprintln!` nobody sees.
     writeln!(std::io::stderr(), "SKIPPED the book's `{what}`: {why}").unwrap();
 }
-

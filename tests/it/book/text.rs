@@ -98,7 +98,9 @@ pub(super) fn blocks(text: &str) -> Vec<Block> {
 
 /// What is in a block that is none of commands (or in an indented one), though it begins like a command.
 pub(super) fn commands_elsewhere(text: &str) -> Vec<String> {
-    let programs = ["telemime", "cargo", "sudo", "ssh", "mdbook", "python3", "pip", "mcap", "rerun"];
+    let programs = [
+        "telemime", "cargo", "sudo", "ssh", "mdbook", "python3", "pip", "mcap", "rerun",
+    ];
     let mut fence: Option<&str> = None;
     let mut found = Vec::new();
     for line in text.lines() {
