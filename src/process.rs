@@ -74,6 +74,11 @@ impl Process {
         })
     }
 
+    /// Where to read what CPU time it has taken.
+    pub(crate) fn cpu_time(&self) -> CpuTime {
+        CpuTime(self.child.id())
+    }
+
     /// The next event; `None` once the process has closed its stdout.
     pub(crate) async fn next<E: DeserializeOwned>(&mut self) -> anyhow::Result<Option<E>> {
         let Some(line) = self.lines.next_line().await? else {
@@ -107,6 +112,27 @@ impl Process {
             }
         }
     }
+}
+
+/// The CPU time of a process and all its threads, user's and kernel's, as proc(5) counts it: in hundredths of a second.
+pub(crate) struct CpuTime(Option<u32>);
+
+impl CpuTime {
+    /// Up to now; `None` where the host does not say. A process that has ended says it until it has been waited for.
+    pub(crate) fn read(&self) -> Option<Duration> {
+        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.0?)).ok()?;
+        let ticks = cpu_ticks(&stat)?;
+        let per_s = rustix::param::clock_ticks_per_second();
+        Some(Duration::from_secs_f64(ticks as f64 / per_s as f64))
+    }
+}
+
+/// `utime` and `stime`, fields 14 and 15. The second field, a name, may hold blanks and parentheses.
+fn cpu_ticks(stat: &str) -> Option<u64> {
+    let (_, rest) = stat.rsplit_once(')')?;
+    let mut fields = rest.split_ascii_whitespace().skip(11);
+    let mut next = || fields.next()?.parse::<u64>().ok();
+    Some(next()? + next()?)
 }
 
 /// A path as an argument.
@@ -146,4 +172,24 @@ pub(crate) async fn watch_robot(
         events.push(event);
     }
     bail!("the robot ended before the operator; it says why above")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cpu_time_is_told_whatever_the_process_is_called() {
+        let stat = "7 (a) b (c)) S 1 7 7 0 -1 4194560 900 0 0 0 123 45 6 7 20 0 3 0 99 1000 200";
+        assert_eq!(cpu_ticks(stat), Some(168));
+        assert_eq!(cpu_ticks("7 (a) S 1"), None);
+        let own = CpuTime(Some(std::process::id()));
+        let before = own.read().unwrap();
+        let mut spun = 0_u64;
+        while own.read().unwrap() == before {
+            spun = spun.wrapping_mul(3).wrapping_add(1);
+        }
+        assert!(own.read().unwrap() > before);
+        assert_eq!(CpuTime(None).read(), None);
+    }
 }

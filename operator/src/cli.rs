@@ -7,6 +7,7 @@ mod known;
 mod pair;
 mod played;
 mod report;
+mod scores;
 mod settings;
 mod skills;
 
@@ -41,7 +42,8 @@ pub use input::InputArgs;
 use known::Known as KnownRobot;
 pub use pair::{PairArgs, pair};
 use played::Played;
-pub use report::{Event, PlayReport, Scores, TurnScores};
+pub use report::Event;
+pub use scores::{PlayReport, Scores, TurnScores};
 pub use skills::Skills;
 
 /// Runs the daemon until its task is done.

@@ -1,13 +1,14 @@
 //! The operator's shell: dials, redials, feeds the session samples and moves its bytes.
 
 mod attend;
+mod console;
+mod redial;
+mod said;
+mod teach;
 
-use std::borrow::Cow;
 use std::fmt;
-use std::future::Future;
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -21,20 +22,20 @@ use telemime_endpoint::{
 };
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
-use telemime_protocol::wire::hello::RejectCode;
-use telemime_protocol::wire::{DecodeError, Version};
+use telemime_protocol::wire::DecodeError;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{sleep_until, timeout};
 
-use crate::console::{Act, Shape};
-use crate::dial::{DialError, Dialler, Link, Seen};
-use crate::input::Driver;
-use crate::lessons::{Lesson, LessonError, Lessons};
+use crate::dial::{Link, Seen};
+use crate::lessons::Lessons;
 use crate::recognise::Recogniser;
 use crate::session::{Counters, Event, Output, Seen as LinkSeen, Session, SessionConfig};
 use crate::task::{Advice, Outcome, Task};
+use console::{Console, NOT_HERE};
+use said::Marks;
 
 pub use attend::Snapshot;
+pub use said::{DaemonError, Notice, Summary};
 
 /// A robot that has ended its stream gets this long to say why.
 const LAST_WORDS: Duration = Duration::from_millis(500);
@@ -99,183 +100,6 @@ pub struct Learning {
     pub refine: bool,
     /// Saves the refined skill into this folder.
     pub save: Option<PathBuf>,
-}
-
-/// Why the daemon ended without doing its task.
-#[derive(Debug, thiserror::Error)]
-pub enum DaemonError {
-    /// The robot could not be reached at all.
-    #[error("cannot reach the robot at {addr}: {why}")]
-    Unreachable {
-        /// Its address.
-        addr: SocketAddr,
-        /// The last attempt's error.
-        why: String,
-    },
-    /// The robot declined the session.
-    #[error("the robot at {addr} declines: {text}")]
-    Rejected {
-        /// Its address.
-        addr: SocketAddr,
-        /// Why, for machines.
-        code: RejectCode,
-        /// Why, for people.
-        text: String,
-    },
-    /// Another key answers than the one that is pinned.
-    #[error(
-        "the robot at {addr} has another key than the one we know: it shows {}. Either it was set up anew, or somebody \
-         is in between; nothing was sent. If it was on purpose, run `telemime peers remove` for the old key and pair again",
-        shown.map_or_else(|| "none we can read".to_owned(), |key| key.to_string())
-    )]
-    KeyChanged {
-        /// Its address.
-        addr: SocketAddr,
-        /// What it shows.
-        shown: Option<Fingerprint>,
-    },
-    /// The robot has revoked our key.
-    #[error(
-        "the robot at {addr} has revoked our key: it must be removed there (`telemime peers remove`) before it can be paired again"
-    )]
-    Revoked {
-        /// Its address.
-        addr: SocketAddr,
-    },
-}
-
-/// What there is to know afterwards.
-#[derive(Debug, Clone)]
-pub struct Summary {
-    /// How the task ended.
-    pub outcome: Outcome,
-    /// Sums over all sessions.
-    pub counters: Counters,
-    /// Traffic from first packet to last.
-    pub total: Counts,
-    /// Traffic from the request that was granted until the release had been sent.
-    pub engaged: Counts,
-    /// Sessions begun.
-    pub sessions: u32,
-    /// What became of the datagrams of the last session in which something was driven.
-    pub seen: LinkSeen,
-}
-
-/// Something for a log or a progress bar.
-#[derive(Debug, Clone)]
-pub enum Notice {
-    /// An attempt to connect failed and will be repeated.
-    Dialling {
-        /// Why.
-        why: String,
-    },
-    /// A session began.
-    Connected {
-        /// Its epoch.
-        epoch: u32,
-        /// The protocol version both speak.
-        version: Version,
-    },
-    /// The connection was lost.
-    Lost {
-        /// Why.
-        why: String,
-    },
-    /// Something happened in the session, at this time of the session clock.
-    Event(Stamp, Event),
-    /// How far the task has got, in [0, 1]; a few times a second.
-    Progress(f64),
-    /// What became of something the person at the terminal said.
-    Note(Cow<'static, str>),
-    /// A performance of the task is over, and its recording's time was 0 then.
-    Performed {
-        /// Which one, from 1 on.
-        number: u32,
-        /// When, on the session clock, the recording's first sample was valid.
-        zero: Stamp,
-    },
-    /// The link is to be like that: for whoever shapes it.
-    LinkAsked(Shape),
-    /// A performance was kept, by this name.
-    Kept(String),
-    /// The skill was refined.
-    Refined {
-        /// It.
-        skill: Arc<Skill>,
-        /// The performance, and the share of it that was new to the skill.
-        learned: Vec<(String, f64)>,
-    },
-    /// The skill was written to this file.
-    Saved(PathBuf),
-    /// The scale the next engagement uses, and ε_path, m.
-    Mapping {
-        /// Tip metres per hand metre.
-        scale: f64,
-        /// ε_path, m.
-        path_bound_m: f64,
-        /// The robot.
-        robot: String,
-    },
-}
-
-const NOT_HERE: &str =
-    "an operator is paired by `telemime pair HOST:PORT`, a robot on its own terminal";
-
-/// What the person at the terminal says.
-struct Console<'a> {
-    quit: &'a mut watch::Receiver<bool>,
-    words: &'a mut mpsc::UnboundedReceiver<Word>,
-    notices: &'a mpsc::UnboundedSender<Notice>,
-}
-
-impl Console<'_> {
-    /// Does `work` while nobody can be told: a stop is kept in `stop`, a reset is not.
-    async fn beside<T>(
-        &mut self,
-        now: impl Fn() -> Stamp,
-        task: &mut Task,
-        stop: &mut bool,
-        work: impl Future<Output = T>,
-    ) -> T {
-        let mut work = pin!(work);
-        loop {
-            tokio::select! {
-                biased;
-                heard = task.hear() => {
-                    match task.handle(now(), heard, None) {
-                        Some(Act::Stop) => *stop = true,
-                        Some(Act::Shape(shape)) => drop(self.notices.send(Notice::LinkAsked(shape))),
-                        // Refused without a session.
-                        Some(Act::Learn { .. } | Act::Use(_)) | None => {}
-                    }
-                    self.tell(task);
-                }
-                Some(word) = self.words.recv() => self.note(match word {
-                    Word::Stop => {
-                        *stop = true;
-                        "there is no link: the emergency stop is the first thing the robot will hear"
-                    }
-                    Word::Reset => "there is no link: the reset is discarded",
-                    Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => NOT_HERE,
-                    Word::Engage | Word::Release | Word::Keep | Word::Refine | Word::Save(_) => {
-                        "there is no link: say it again when it is back"
-                    }
-                }),
-                done = &mut work => return done,
-            }
-        }
-    }
-
-    /// What the input has to tell.
-    fn tell(&self, task: &mut Task) {
-        while let Some(note) = task.driver().and_then(Driver::poll_note) {
-            self.note(note);
-        }
-    }
-
-    fn note(&self, text: impl Into<Cow<'static, str>>) {
-        let _ = self.notices.send(Notice::Note(text.into()));
-    }
 }
 
 enum End {
@@ -390,80 +214,6 @@ impl Daemon {
 
     fn instant(&self, at: Stamp) -> tokio::time::Instant {
         self.clock.instant(Mono(at.0.saturating_add(self.epoch.0)))
-    }
-
-    /// Dials until there is a session; `None` once the task is over anyway and no `stop` has to be delivered.
-    /// `seen` is what the last session's link was like, if there was one.
-    async fn dial(
-        &self,
-        endpoint: &mut Endpoint,
-        seen: Option<Seen>,
-        task: &mut Task,
-        console: &mut Console<'_>,
-        stop: &mut bool,
-    ) -> Result<Option<Link>, DaemonError> {
-        let (begun, first, addr) = (self.now(), seen.is_none(), self.robot);
-        let mut dialler = Dialler::new(endpoint, addr, self.config.versions, seen);
-        let (mut said, mut bound) = (None, begun);
-        loop {
-            let outcome = console
-                .beside(|| self.now(), task, stop, dialler.next())
-                .await;
-            let patient = self.now().secs_since(begun) <= self.patience.as_secs_f64();
-            let why = match outcome {
-                Some(Ok(link)) => return Ok(Some(link)),
-                None => None,
-                Some(Err(DialError::Again(why))) => Some(why),
-                Some(Err(DialError::NoSocket)) => {
-                    bound = Stamp(i64::MIN);
-                    Some("our socket has failed".into())
-                }
-                // An operator that lost its link, or comes back, may find its own old session still in authority.
-                Some(Err(DialError::Rejected {
-                    code: RejectCode::Busy,
-                    text,
-                })) if !first || patient => Some(text),
-                Some(Err(DialError::Rejected { code, text })) => {
-                    return Err(DaemonError::Rejected { addr, code, text });
-                }
-                Some(Err(DialError::KeyChanged)) => {
-                    let shown = self.trust.turned_away();
-                    let changed = DaemonError::KeyChanged { addr, shown };
-                    if first {
-                        return Err(changed);
-                    }
-                    // Whoever answers in its place now need not be there for long.
-                    Some(changed.to_string())
-                }
-                Some(Err(DialError::Revoked)) => return Err(DaemonError::Revoked { addr }),
-            };
-            if self.now().secs_since(bound) > SOCKET_PATIENCE_S
-                && (!first || bound.0 == i64::MIN)
-                && let Some(reopen) = &self.reopen
-            {
-                bound = self.now();
-                match (reopen.0)() {
-                    Ok(other) => {
-                        *endpoint = other;
-                        dialler.move_to(endpoint);
-                    }
-                    Err(e) => console.note(format!("no other socket to be had: {e}")),
-                }
-            }
-            if first && !patient {
-                let why = why.or(said);
-                let why = why.unwrap_or_else(|| "no answer".into());
-                return Err(DaemonError::Unreachable { addr, why });
-            }
-            if task.is_over(self.now()) && !*stop {
-                return Ok(None);
-            }
-            if why.is_some() && why != said {
-                said.clone_from(&why);
-                let why = why.unwrap_or_default();
-                let _ = console.notices.send(Notice::Dialling { why });
-            }
-        }
     }
 
     async fn drive(
@@ -620,104 +370,6 @@ impl Daemon {
         }
     }
 
-    /// What the person at the page wants, and only the daemon can do.
-    fn act(
-        &self,
-        act: Act,
-        session: &mut Session,
-        task: &mut Task,
-        lessons: &mut Lessons,
-        notices: &mpsc::UnboundedSender<Notice>,
-    ) {
-        match act {
-            Act::Stop => session.stop(self.now()),
-            Act::Shape(shape) => drop(notices.send(Notice::LinkAsked(shape))),
-            Act::Use(skill) => {
-                lessons.adopt(Arc::clone(&skill));
-                session.replace_skill(skill);
-            }
-            Act::Learn {
-                name,
-                strokes,
-                others,
-            } => {
-                if let Err((strokes, why)) = lessons.teach(name, strokes, others)
-                    && let Some(live) = task.person()
-                {
-                    live.on_no_lesson(strokes, &why);
-                }
-            }
-        }
-    }
-
-    /// What the person at the terminal says of learning.
-    fn lesson(
-        &self,
-        word: &Word,
-        session: &Session,
-        lessons: &mut Lessons,
-        notices: &mpsc::UnboundedSender<Notice>,
-    ) -> Result<(), LessonError> {
-        match word {
-            Word::Keep => {
-                let _ = notices.send(Notice::Kept(lessons.keep(session.driven())?));
-            }
-            Word::Refine => lessons.refine()?,
-            Word::Save(file) => {
-                lessons.save(file)?;
-                let _ = notices.send(Notice::Saved(file.clone()));
-            }
-            Word::Stop | Word::Reset | Word::Engage | Word::Release => {}
-            Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => {}
-        }
-        Ok(())
-    }
-
-    /// Tells what was learned, saves it if that is wanted, and returns the skill if it is a new one.
-    fn learned(
-        &self,
-        lesson: Result<Lesson, LessonError>,
-        lessons: &Lessons,
-        task: &mut Task,
-        notices: &mpsc::UnboundedSender<Notice>,
-    ) -> Option<Arc<Skill>> {
-        if let Some(live) = task.person() {
-            live.on_lesson(&lesson);
-        }
-        let note = |text: String| drop(notices.send(Notice::Note(text.into())));
-        let lesson = match lesson {
-            Ok(lesson) => lesson,
-            Err(e) => {
-                note(e.to_string());
-                return None;
-            }
-        };
-        for (name, why) in &lesson.left_out {
-            note(format!("{name} is not learned from: {why}"));
-        }
-        for what in lesson.learned.iter().filter(|what| what.is_unlike()) {
-            note(format!(
-                "{} is unlike what the skill has seen: {:.0} % of it is new",
-                what.name,
-                what.novel * 1e2
-            ));
-        }
-        let skill = lesson.skill?;
-        let learned = lesson.learned.into_iter().map(|w| (w.name, w.novel));
-        let _ = notices.send(Notice::Refined {
-            skill: Arc::clone(&skill),
-            learned: learned.collect(),
-        });
-        let folder = self.learning.save.as_deref();
-        if let Some(file) = folder.and_then(|folder| lessons.file_in(folder)) {
-            match lessons.save(&file) {
-                Ok(()) => drop(notices.send(Notice::Saved(file))),
-                Err(e) => note(e.to_string()),
-            }
-        }
-        Some(skill)
-    }
-
     fn flush(
         &self,
         session: &mut Session,
@@ -766,32 +418,4 @@ async fn last_words(connection: &Connection, otherwise: String) -> String {
 fn malformed(connection: &Connection, error: &DecodeError) -> String {
     connection.close(VarInt::from_u32(1), b"malformed control message");
     format!("the robot sent a malformed message: {error}")
-}
-
-/// Traffic at the request that was granted and after the release.
-#[derive(Debug, Default)]
-struct Marks {
-    requests: u32,
-    requested: Counts,
-    granted: Option<Counts>,
-    released: Option<Counts>,
-    progress: f64,
-    performances: u32,
-}
-
-impl Marks {
-    /// Before anything that follows the newest request is handed to QUIC.
-    fn on_request(&mut self, requests: u32, counts: Counts) {
-        if self.requests != requests {
-            self.requests = requests;
-            self.requested = counts;
-        }
-    }
-
-    fn span(&self, total: Counts) -> Counts {
-        let Some(from) = self.granted else {
-            return Counts::default();
-        };
-        self.released.unwrap_or(total).since(from)
-    }
 }

@@ -166,6 +166,7 @@ pub(super) fn drive(
         knots,
         scale: mapping.scale,
         heard_s: None,
+        cpu: None,
         simulated_s: end_s + REST_S,
     }
 }

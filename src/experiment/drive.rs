@@ -104,6 +104,7 @@ pub(super) fn drive(
         knots: raw.counters.knots - raw.counters.rest_knots,
         scale,
         heard_s: None,
+        cpu: None,
         simulated_s: raw.simulated_s,
     };
     let why = match &raw.outcome {

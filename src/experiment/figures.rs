@@ -119,6 +119,10 @@ figures! {
     stop_m
     /// From the outage's end until the operator hears from the robot.
     reconnect_s
+    /// CPU time of the operator's process per second of wall time.
+    operator_cpu
+    /// Of the robot's.
+    robot_cpu
 }
 
 /// The horizons of prediction, s, in the order of the columns.

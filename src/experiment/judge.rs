@@ -66,6 +66,8 @@ pub(super) fn judge(
     let end_s = truth.span_s().1;
     let mut figures = Figures {
         scale: Some(trace.scale).filter(|s| s.is_finite()),
+        operator_cpu: trace.cpu.map(|(operator, _)| operator),
+        robot_cpu: trace.cpu.map(|(_, robot)| robot),
         ..Figures::default()
     };
     if let Outcome::NotDriven(_) = trace.outcome {
@@ -298,6 +300,7 @@ mod tests {
                 (3.05, Some(1.95)),
                 (3.25, None),
             ]),
+            cpu: None,
             simulated_s: 5.0,
         }
     }

@@ -59,6 +59,8 @@ pub(super) struct Trace {
     /// When the operator heard from the robot, and when that was true (as far as is known), s of the recording; none where
     /// it does not say.
     pub(super) heard_s: Option<Vec<(f64, Option<f64>)>>,
+    /// Seconds of CPU per second that the operator's and the robot's process took; none where they are no processes.
+    pub(super) cpu: Option<(f64, f64)>,
     /// How long it ran, s: on a virtual clock, or in truth.
     pub(super) simulated_s: f64,
 }

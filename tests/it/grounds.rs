@@ -94,6 +94,13 @@ fn agree(there: &[Row], here: &[Row], ground: &str, seen: bool) {
     }
     // Without a process that says when it heard, nobody knows.
     assert!(real["reconnect_s"].is_empty());
+    for process in ["operator_cpu", "robot_cpu"] {
+        let cores = number(real, process);
+        println!("{process}: {cores}");
+        // The robot steps an arm a thousand times a second; both have a few threads.
+        assert!(cores > 0.0 && cores < 4.0, "{process}: {cores}");
+        assert!(ours[process].is_empty() && hold[process].is_empty());
+    }
     // What is predicted from the recording alone is no matter of the ground.
     assert_eq!(ours["predicted_200ms_m"], real["predicted_200ms_m"]);
 }

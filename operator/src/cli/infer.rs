@@ -6,7 +6,7 @@ use telemime_protocol::checkpoint::{PosePlan, select, turns};
 use telemime_protocol::skill::{Gmr, Skill};
 use telemime_protocol::wire::codec;
 
-use super::report::{PlayReport, Scores, TurnScores};
+use super::scores::{PlayReport, Scores, TurnScores};
 use crate::placed::{Motion, Placed};
 
 /// Inferred motions are sampled at this interval before they are compressed, s.

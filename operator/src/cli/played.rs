@@ -5,7 +5,8 @@ use telemime_protocol::checkpoint::PoseCurve;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{RobotState, Telemetry};
 
-use super::report::{Event, Scores, TurnScores};
+use super::report::Event;
+use super::scores::{Scores, TurnScores};
 use crate::learn::align::Aligned;
 use crate::session;
 

@@ -9,14 +9,16 @@
 //!
 //! The second is checked along the whole way to the stop, by steps that no point of the arm can be faster than (conservative advancement, Mirtich 1996).
 
+mod kept;
+#[cfg(test)]
+mod tests;
+
 use std::sync::Arc;
 
 use nalgebra::Vector3;
-use serde::{Deserialize, Serialize};
 use telemime_sim::arm::{ArmModel, JointKind, Joints, Kinematics, SelfCollision};
 
-/// The most planes a workspace has.
-pub const MAX_PLANES: usize = 6;
+pub use kept::{BarrierConfig, BarrierError, MAX_PLANES, Plane};
 
 /// Room that the second stage leaves, m: what a tick may take of it unseen.
 const HARD_M: f64 = 0.004;
@@ -32,121 +34,6 @@ const CLIP_ROUNDS: u32 = 200;
 
 /// A way to a stop that takes more looks than this is too long to take.
 const LOOKS: usize = 16;
-
-/// A half-space that the tip must stay in, and every link behind it that begins there.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Plane {
-    normal: Vector3<f64>,
-    offset_m: f64,
-}
-
-impl Plane {
-    /// All points with n·x ≥ `offset_m`, base axes, m; `normal` is made unit.
-    ///
-    /// # Errors
-    /// [`BarrierError::Plane`]: no direction, or a number that is not finite.
-    pub fn new(normal: Vector3<f64>, offset_m: f64) -> Result<Self, BarrierError> {
-        let unit = normal.try_normalize(1e-9).filter(|n| n.norm().is_finite());
-        match unit {
-            Some(normal) if offset_m.is_finite() => Ok(Self { normal, offset_m }),
-            _ => Err(BarrierError::Plane {
-                normal: normal.into(),
-                offset_m,
-            }),
-        }
-    }
-
-    /// How far inside a point is, m.
-    pub fn height_m(&self, p: &Vector3<f64>) -> f64 {
-        self.normal.dot(p) - self.offset_m
-    }
-}
-
-/// What is kept apart, and how early.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct BarrierConfig {
-    /// Whether links are kept apart from each other.
-    pub self_collision: bool,
-    /// Two capsules never come nearer, m.
-    pub stop_m: f64,
-    /// Approach is slowed from this much room on, m.
-    pub slow_m: f64,
-    /// γ, 1/s: room never shrinks faster than by this share of it in a second.
-    pub gain: f64,
-    /// Planes that the tip, and the links that begin inside, stay inside of.
-    pub planes: [Option<Plane>; MAX_PLANES],
-}
-
-impl Default for BarrierConfig {
-    /// Links 2 cm apart, slowed within 10 cm of that, no planes.
-    fn default() -> Self {
-        Self {
-            self_collision: true,
-            stop_m: 0.02,
-            slow_m: 0.1,
-            gain: 10.0,
-            planes: [None; MAX_PLANES],
-        }
-    }
-}
-
-impl BarrierConfig {
-    /// The pairs of links that are kept apart, of an arm that starts at `start`: not those that are within 10 mm of the stop distance there, or nearly always.
-    pub fn hulls(&self, arm: &ArmModel, start: &Joints) -> SelfCollision {
-        SelfCollision::new(arm, start, self.stop_m + 2.0 * SOFT_M)
-    }
-
-    /// The same with one plane more.
-    ///
-    /// # Errors
-    /// [`BarrierError::TooManyPlanes`].
-    pub fn with_plane(mut self, plane: Plane) -> Result<Self, BarrierError> {
-        let free = self.planes.iter_mut().find(|p| p.is_none());
-        *free.ok_or(BarrierError::TooManyPlanes)? = Some(plane);
-        Ok(self)
-    }
-}
-
-/// Why there is no such barrier.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum BarrierError {
-    /// Not a plane.
-    #[error("a plane with normal {normal:?} at {offset_m} m: give a direction and a place")]
-    Plane {
-        /// The normal given.
-        normal: [f64; 3],
-        /// The place given, m.
-        offset_m: f64,
-    },
-    /// More planes than the fixed array holds.
-    #[error("at most {MAX_PLANES} planes are kept")]
-    TooManyPlanes,
-    /// A distance or gain out of its range.
-    #[error("the {what} is {value}; it must be between {least} and {most}")]
-    Range {
-        /// Which value.
-        what: &'static str,
-        /// Its value.
-        value: f64,
-        /// The smallest.
-        least: f64,
-        /// The largest.
-        most: f64,
-    },
-    /// The arm starts on the wrong side.
-    #[error(
-        "at the start posture the tip is {:.3} m behind the plane n = {normal:?}, offset {offset_m} m (it must be {SOFT_M} m inside): move the plane, or give another start posture",
-        -height_m
-    )]
-    StartsOutside {
-        /// The plane's normal.
-        normal: [f64; 3],
-        /// Its place, m.
-        offset_m: f64,
-        /// How far inside the tip is, m.
-        height_m: f64,
-    },
-}
 
 /// What a tick was slowed for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -515,86 +402,4 @@ fn reaches(arm: &ArmModel) -> Joints {
         };
     }
     out
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn braking_tick_by_tick_goes_as_far_as_it_says() {
-        for (v, a) in [
-            (1.0, 30.0),
-            (0.03, 30.0),
-            (0.01, 30.0),
-            (2.0, 7.3),
-            (1e-4, 5.0),
-        ] {
-            let h = 1e-3;
-            let (mut speed, mut gone) = (v, 0.0);
-            for tick in 0..2000 {
-                let t = f64::from(tick) * h;
-                assert!((braked(v, a, t, h) - gone).abs() < 1e-12, "{v} {a} {t}");
-                let next = speed - f64::min(speed, a * h);
-                gone += 0.5 * (speed + next) * h;
-                speed = next;
-            }
-            assert!((braking(v, a, h) - gone).abs() < 1e-12);
-        }
-    }
-
-    #[test]
-    fn a_target_behind_oblique_planes_is_moved_before_all_of_them() {
-        let arm = crate::rig::Rig::load(&crate::rig::RigOptions::default()).unwrap();
-        // A wedge of 60°: what is moved over one of its sides comes to lie behind the other.
-        let side = |y: f64| Plane::new(Vector3::new(0.0, y, 0.5), 0.05).unwrap();
-        let config = BarrierConfig::default()
-            .with_plane(side(0.75_f64.sqrt()))
-            .and_then(|config| config.with_plane(side(-(0.75_f64.sqrt()))))
-            .unwrap();
-        let barrier = |config: &BarrierConfig| {
-            let (model, home) = (arm.arm.clone(), arm.home);
-            Barrier::new(model, config, Joints::repeat(10.0), &home, 1e-3)
-        };
-        let Ok(wedge) = barrier(&config) else {
-            panic!("the tip starts within");
-        };
-        for y in [-0.5, -0.1, 0.0, 0.03, 0.4] {
-            let (at, moved) = wedge.clip(Vector3::new(0.3, y, -0.3));
-            assert!(moved);
-            for plane in config.planes.iter().flatten() {
-                let height_m = plane.height_m(&at);
-                assert!(height_m >= SOFT_M - 2.0 * CLIPPED_M, "{y}: {height_m}");
-            }
-        }
-        let within = Vector3::new(0.3, 0.0, 1.0);
-        assert_eq!(wedge.clip(within), (within, false));
-        // Planes that leave no room are no endless loop.
-        let up = Plane::new(Vector3::z(), 0.1).unwrap();
-        let mut walls = barrier(&BarrierConfig::default().with_plane(up).unwrap()).unwrap();
-        walls.config = walls
-            .config
-            .with_plane(Plane::new(-Vector3::z(), 0.1).unwrap())
-            .unwrap();
-        assert!(walls.clip(Vector3::zeros()).0.z.is_finite());
-    }
-
-    #[test]
-    fn planes_and_distances_that_are_none_are_refused() {
-        assert!(matches!(
-            Plane::new(Vector3::zeros(), 0.0),
-            Err(BarrierError::Plane { .. })
-        ));
-        assert!(matches!(
-            Plane::new(Vector3::z(), f64::NAN),
-            Err(BarrierError::Plane { .. })
-        ));
-        let plane = Plane::new(Vector3::z() * 2.0, 0.5).unwrap();
-        assert_eq!(plane.height_m(&Vector3::new(9.0, 9.0, 0.75)), 0.25);
-        let mut config = BarrierConfig::default();
-        for _ in 0..MAX_PLANES {
-            config = config.with_plane(plane).unwrap();
-        }
-        assert_eq!(config.with_plane(plane), Err(BarrierError::TooManyPlanes));
-    }
 }

@@ -4,10 +4,12 @@
 //! reads a clock: a tick is `dt_s` long.
 
 mod barrier;
+mod clamps;
 mod controller;
 mod filter;
 mod ik;
 mod posture;
+mod resolve;
 mod torque;
 mod turn;
 
@@ -15,9 +17,9 @@ mod turn;
 mod tests;
 
 pub use barrier::{BarrierConfig, BarrierError, MAX_PLANES, Plane};
+pub use clamps::{ClampCounts, Clamps};
 pub use controller::{
-    ClampCounts, Clamps, ControlConfig, ControlError, Controller, ControllerState, Demand,
-    ForeignState, Output,
+    ControlConfig, ControlError, Controller, ControllerState, Demand, ForeignState, Output,
 };
 pub use filter::{FilterConfig, FilterError, FilterState, LimitedFilter};
 pub use ik::{IkConfig, JointReference, JointStep};

@@ -6,7 +6,7 @@ use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use telemime_sim::arm::{ArmModel, Dynamics, Joint, JointKind, Joints, Kinematics, MAX_JOINTS};
 
 use super::ControlError;
-use super::ik::{largest_share, min_eigenvalue, orientation_error, resolve};
+use super::resolve::{largest_share, min_eigenvalue, orientation_error, resolve};
 
 /// No joint reference accelerates faster, rad/s² (m/s²), whatever its motor could do with it alone: joints load each other.
 pub(super) const ACCELERATION_CAP: f64 = 30.0;

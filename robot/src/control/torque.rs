@@ -3,7 +3,7 @@
 use telemime_sim::arm::{ArmModel, Dynamics, Joints};
 
 use super::JointReference;
-use super::ik::largest_share;
+use super::resolve::largest_share;
 
 /// A joint left behind by a cut torque returns to its reference faster than that by at most this share of its speed limit.
 const CATCH_UP: f64 = 0.1;

@@ -6,8 +6,8 @@ use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 use telemime_sim::arm::{ArmModel, Dynamics, Joints};
 
-use super::ik::turning_rates;
 use super::posture::{ACCELERATION_CAP, headroom, turned_around};
+use super::resolve::turning_rates;
 use super::{ControlError, FilterConfig, FilterError, FilterState, LimitedFilter};
 
 /// A target this close to half a turn away, rad, is approached the way round that the output already turns: noise about

@@ -42,7 +42,26 @@ pub(super) struct Left {
     pub(super) passages: Option<Vec<Passage>>,
     /// Every tick.
     pub(super) ticks: PathBuf,
+    /// Seconds of CPU per second, of operator and robot, from the mapping's agreement to the operator's result; none without
+    /// the latter.
+    pub(super) cpu: Option<(f64, f64)>,
     pub(super) took_s: f64,
+}
+
+/// CPU time of operator and robot at two moments.
+#[derive(Default)]
+struct Usage {
+    begun: Option<(Instant, Duration, Duration)>,
+    done: Option<(Instant, Duration, Duration)>,
+}
+
+impl Usage {
+    fn shares(&self) -> Option<(f64, f64)> {
+        let ((from, operator_0, robot_0), (to, operator, robot)) = (self.begun?, self.done?);
+        let wall_s = (to - from).as_secs_f64();
+        let share = |before, after: Duration| after.saturating_sub(before).as_secs_f64() / wall_s;
+        (wall_s > 0.0).then(|| (share(operator_0, operator), share(robot_0, robot)))
+    }
 }
 
 /// A robot that listens.
@@ -208,6 +227,9 @@ impl Driven<'_> {
         let most = Duration::from_secs_f64(length_s + MOST_BESIDE_S);
         let clock = HostClock::new();
         let zero_s = REST_S - self.settings.input_latency_s;
+        let mut used = Usage::default();
+        let (operator_used, robot_used) = (operator.cpu_time(), robot.cpu_time());
+        let read = || Some((Instant::now(), operator_used.read()?, robot_used.read()?));
         let driving = async {
             let mut known = false;
             while let Some(event) = operator.next().await? {
@@ -215,6 +237,10 @@ impl Driven<'_> {
                 if matches!(event, Operator::Mapping { .. }) && !std::mem::replace(&mut known, true)
                 {
                     begin(clock.now().offset_by_secs(zero_s));
+                    used.begun = read();
+                }
+                if matches!(event, Operator::Done { .. }) {
+                    used.done = read();
                 }
                 operator_events.push(event);
             }
@@ -244,6 +270,7 @@ impl Driven<'_> {
             operator: operator_events,
             passages: None,
             ticks: self.ticks(),
+            cpu: used.shares(),
             took_s: began.elapsed().as_secs_f64(),
         })
     }

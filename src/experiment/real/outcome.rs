@@ -48,6 +48,7 @@ pub(super) fn trace(settings: &Settings, subject: &Subject, left: Left) -> anyho
         knots,
         scale: f64::NAN,
         heard_s: None,
+        cpu: left.cpu,
         simulated_s: left.took_s,
     };
     let Some(zero_ns) = zero_ns else {

@@ -171,7 +171,7 @@ pub(super) fn scaled(i: Interval, unit: f64, decimals: usize) -> String {
 }
 
 /// Heading, figure, unit, decimals.
-const COLUMNS: [(&str, &str, f64, usize); 14] = [
+const COLUMNS: [(&str, &str, f64, usize); 16] = [
     ("error / mm", "rmse_m", 1e3, 0),
     ("p99 / mm", "error_p99_m", 1e3, 0),
     ("turn / °", "turn_rmse_rad", 57.295_779_513, 1),
@@ -186,6 +186,8 @@ const COLUMNS: [(&str, &str, f64, usize); 14] = [
     ("down / kbit/s", "down_bytes_per_s", 8e-3, 1),
     ("followed / %", "followed", 100.0, 0),
     ("stop / s", "stop_s", 1.0, 2),
+    ("operator CPU / %", "operator_cpu", 100.0, 1),
+    ("robot CPU / %", "robot_cpu", 100.0, 1),
 ];
 
 fn tables(view: &View<'_>) -> String {

@@ -19,6 +19,7 @@ impl Live {
         match *self {}
     }
 
+    #[expect(clippy::extra_unused_type_parameters, reason = "as the other one's")]
     pub(in crate::recording) fn message<T: Encode>(&mut self, _: &'static str, _: At, _: &[u8]) {
         match *self {}
     }
