@@ -38,6 +38,10 @@ pub fn own_name(given: Option<&str>) -> anyhow::Result<Name> {
 
 /// What a daemon's own program does to its host, besides being the daemon.
 #[derive(Debug, Subcommand)]
+#[expect(
+    missing_docs,
+    reason = "a comment here would hide the help that these have"
+)]
 pub enum HostCommand {
     Identity(IdentityArgs),
     Peers(PeersArgs),

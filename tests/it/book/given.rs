@@ -14,7 +14,7 @@ use super::text::root;
 use crate::data::data;
 
 /// Of each folder of public recordings: commands are run as they stand, on few files.
-const FILES: usize = 4;
+const FILES: usize = 2;
 
 /// Of each set of folders.
 const FOLDERS: usize = 2;

@@ -1,11 +1,12 @@
 //! A reader at two hosts: types what a block says, waits for it, and knows what could not be tried here.
 
+use std::collections::BTreeSet;
 use std::io::{BufRead, BufReader, Write as _};
 use std::net::UdpSocket;
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 
@@ -16,6 +17,9 @@ const PATIENCE: Duration = Duration::from_secs(300);
 
 /// The console page has one default address.
 static PAGE: Mutex<()> = Mutex::new(());
+
+/// The demos that were shown: the same line twice would be the same again.
+static SHOWN: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
 
 /// What the documents call the robot.
 const ROBOT: [&str; 5] = [
@@ -38,6 +42,8 @@ pub(super) struct Reader {
 pub(super) struct Tally {
     pub(super) ran: Vec<String>,
     pub(super) checked: Vec<String>,
+    /// Shown to another reader.
+    pub(super) again: usize,
     pub(super) skipped: Vec<(String, String)>,
     /// With who runs them.
     pub(super) elsewhere: Vec<(String, String)>,
@@ -92,6 +98,12 @@ impl Drop for Reader {
             let _ = robot.child.wait();
         }
     }
+}
+
+/// Whether this is the first time.
+fn shown(line: &str) -> bool {
+    let mut all = SHOWN.lock().unwrap_or_else(PoisonError::into_inner);
+    all.insert(line.to_owned())
 }
 
 fn there_is(program: &str) -> bool {
@@ -159,9 +171,13 @@ impl Reader {
                 self.tally.checked.push(line.clone());
             } else if let Some(why) = &lacks {
                 self.tally.skipped.push((line.clone(), why.clone()));
+            } else if line.starts_with("telemime demo --") && !shown(line) {
+                self.tally.again += 1;
             } else {
-                println!("{}$ {line}", block.how.join(" "));
+                let begun = Instant::now();
                 self.types(block, line);
+                let took_s = begun.elapsed().as_secs_f64();
+                println!("{took_s:5.1} s {}$ {line}", block.how.join(" "));
                 self.tally.ran.push(line.clone());
             }
         }
