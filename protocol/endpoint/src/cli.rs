@@ -3,6 +3,7 @@
 use std::io::{self, BufRead, IsTerminal, Read, Write};
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::PathBuf;
+use std::process::ExitCode;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 use std::time::Duration;
@@ -24,6 +25,18 @@ pub fn config_dir() -> PathBuf {
         .or_else(|| set("HOME").map(|home| home.join(".config")))
         .unwrap_or_default()
         .join("telemime")
+}
+
+/// What a program ends with: 0, 1 (failed, with one line on stderr) or 2 (a configuration that cannot be, which has been said).
+pub fn exit_code(program: &str, done: &anyhow::Result<bool>) -> ExitCode {
+    match done {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(2),
+        Err(e) => {
+            eprintln!("{program}: {}", one_line(e.chain()));
+            ExitCode::FAILURE
+        }
+    }
 }
 
 /// The first address a `host:port` stands for.

@@ -7,6 +7,7 @@ use super::charts::Chart;
 use super::group::{Group, Interval};
 use super::outages::outages;
 use super::view::{View, called, delay_s, value};
+use crate::cli::plural;
 use crate::experiment::factor::{FACTORS, UNUSED};
 use crate::experiment::real::Ground;
 use crate::experiment::store::Manifest;
@@ -78,10 +79,6 @@ fn seeds(view: &View<'_>) -> usize {
     all.sort_unstable();
     all.dedup();
     all.len()
-}
-
-pub(super) fn plural(n: usize, one: &str, many: &str) -> String {
-    format!("{n} {}", if n == 1 { one } else { many })
 }
 
 fn summary(view: &View<'_>, manifest: &Manifest) -> String {
