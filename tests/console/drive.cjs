@@ -129,12 +129,13 @@ async function link(person, other) {
   const { page } = person;
   step("the link is set from the page");
   await page.locator("#delay").fill("150");
-  await person.until(() => telemime.link.now.arm.delay_ms > 130).catch(async () => {
-    // Only what moves measures the delay.
-    await person.grab();
-    await person.until(() => telemime.link.now.arm.delay_ms > 130);
-    await page.mouse.up();
-  });
+  // Only what moves measures the delay.
+  for (let slower = false; !slower; ) {
+    await person.engages();
+    const seen = await person.until(() => (telemime.link.now.arm.delay_ms > 130 ? "slower" : telemime.drive.what === null && "let go"));
+    slower = (await seen.jsonValue()) === "slower";
+    await person.released();
+  }
   await page.locator("#delay").fill("60");
   await person.state("Ready");
 

@@ -124,7 +124,7 @@ class Person {
     }
     await this.page.evaluate(async (where) => {
       if (where) document.getElementById(where).scrollIntoView({ block: "end" });
-      Object.assign(telemime.scene ?? {}, { quality: 1, pace: 16, next: 0 });
+      Object.assign(telemime.scene ?? {}, { quality: 1, pace: -1000, next: 0 });
       await new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)));
     }, where);
     await this.page.screenshot({ path: join(this.shots, `${name}.png`) });
