@@ -6,7 +6,7 @@ const { Person, arc, distance, ease, finger, pen } = require("./person.cjs");
 
 /** A finger and a pen drive as the mouse does; lifting it lets go, and so does a gesture that is taken away. */
 async function pointers(browser, url, shots) {
-  const person = await Person.at(browser, url, shots, { viewport: { width: 400, height: 820 }, hasTouch: true, isMobile: true });
+  const person = await Person.at(browser, url, shots, { viewport: { width: 400, height: 820 }, hasTouch: true });
   const { page } = person;
   await person.state("Ready");
   await person.picture("narrow-light");
@@ -18,7 +18,7 @@ async function pointers(browser, url, shots) {
   for (const [kind, pointer, end] of [["touch", touch, touch.up], ["touch", touch, touch.cancel], ["pen", await pen(page)]]) {
     person.pointer = pointer;
     const before = await person.now("arm.tip");
-    await person.drives(1000, (u) => arc(u).map((v) => 0.6 * (end === touch.up ? v : -v)));
+    await person.drives(600, (u) => arc(u).map((v) => 0.6 * (end === touch.up ? v : -v)));
     assert.ok(distance(await person.now("arm.tip"), before) > 0.05, `${kind}: the arm went somewhere`);
     await (end ?? pointer.up)();
     await person.state("Ready");

@@ -81,8 +81,6 @@ async function drive(person) {
     await person.released();
     const all = await shown;
     seen = all.filter(([skill]) => skill === "arc");
-    console.log(JSON.stringify(all.map((r) => r[2]).filter((v, i, a) => !i || v !== a[i - 1])));
-    console.log(JSON.stringify(seen.map(([, p]) => p.toFixed(2)).filter((v, i, a) => !i || v !== a[i - 1])));
   }
   assert.ok(seen.length >= 5, "the arc is recognised");
   assert.ok(seen.every(([, phase]) => phase >= 0 && phase <= 1));
@@ -140,7 +138,6 @@ async function link(person, other) {
   await person.state("Ready");
 
   step("a link that is suddenly slow: the arm coasts, and says so");
-  await person.home();
   const coasts = other.picture("coasting-light", (now) => now.robot.state === "Coasting");
   for (let tries = 0, over = false; !over && tries < 6; tries++) {
     const at = await person.engages();

@@ -59,7 +59,7 @@ async function pen(page) {
 
 class Person {
   static async at(browser, url, shots, options = {}) {
-    const page = await browser.newPage({ viewport: { width: 1000, height: 680 }, colorScheme: "light", ...options });
+    const page = await browser.newPage({ viewport: { width: 1000, height: 680 }, colorScheme: "light", reducedMotion: "reduce", ...options });
     const person = new Person();
     Object.assign(person, { page, shots, wrong: [], pointer: mouse(page) });
     const wrong = (text) => {
