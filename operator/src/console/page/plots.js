@@ -39,12 +39,14 @@ export class Plots {
     if (this.rows.length && t < this.rows.at(-1).t) this.rows = [];
     this.rows.push({ t, ...row });
     while (this.rows[0].t < t - SPAN_MS) this.rows.shift();
+    this.fresh = true;
   }
 
   draw(now) {
     // Nothing scrolls for those who asked for rest: twice a second is enough to read.
-    if (now - this.drawn < (this.slow.matches ? 500 : 100) || !this.rows.length) return;
+    if (now - this.drawn < (this.slow.matches ? 500 : 100) || !this.fresh) return;
     this.drawn = now;
+    this.fresh = false;
     const style = getComputedStyle(this.root);
     this.plots.forEach((plot) => this.strip(plot, style));
   }

@@ -55,6 +55,16 @@ export class Scene {
     return true;
   }
 
+  /** Whether a picture of `what` (numbers, however nested) differs from the last that was asked about, as far as an eye can see. */
+  differs(what) {
+    const { clientWidth, clientHeight } = this.canvas;
+    const seen = JSON.stringify([what, this.view.eye, clientWidth, clientHeight, this.quality, this.colours === DARK],
+      (_, v) => (typeof v === "number" ? Math.round(v * 5000) : v));
+    if (seen === this.seen) return false;
+    this.seen = seen;
+    return true;
+  }
+
   /** `what`: arm, q, hand, ghost, trail, path, knots, targets; whatever is missing is not drawn. */
   draw(what) {
     this.fit();
