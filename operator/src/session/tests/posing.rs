@@ -62,7 +62,7 @@ fn an_orientation_has_a_way_of_its_own_no_finer_than_what_is_predicted() {
         bench.datagrams
     };
     let (fine, wide) = (
-        said(FutureBound::Share(0.01)),
+        said(FutureBound::Share(0.1)),
         said(FutureBound::Share(10.0)),
     );
     assert_eq!(fine, said(FutureBound::Relative(1.5)));
