@@ -18,10 +18,8 @@ fn systemd_starts_watches_and_stops_both_units() {
     let said = String::from_utf8_lossy(&out.stdout);
     let why = String::from_utf8_lossy(&out.stderr);
     println!("{said}");
-    for reason in why
-        .lines()
-        .filter_map(|line| line.strip_prefix("SKIPPED: "))
-    {
+    let lines = why.lines().chain(said.lines());
+    for reason in lines.filter_map(|line| line.strip_prefix("SKIPPED: ")) {
         skipped(reason);
     }
     if out.status.code() != Some(SKIPPED) {
