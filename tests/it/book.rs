@@ -19,8 +19,9 @@ mod text;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use crate::data::skipped;
 use crate::processes::alone;
-use reader::{Reader, cargo_has, own_tests, skipped};
+use reader::{Reader, cargo_has, own_tests};
 use text::{blocks, commands_elsewhere, documents, read, spans};
 
 /// In the order in which they are read: each goes on where the one before has ended.
@@ -114,7 +115,7 @@ fn the_books_commands_do_what_it_says() {
             checked += 1;
         }
         for (line, why) in &tally.skipped {
-            skipped(line, why);
+            skipped(format_args!("the line `{line}`: {why}"));
         }
         for (line, by) in &tally.elsewhere {
             assert!(tests.contains(test_of(by)), "{line}: {by}");

@@ -109,10 +109,9 @@ impl Recorded {
                 Some((to.position - from.position, joint))
             })
             .collect();
-        let mean = |of: fn(&(Vector3<f64>, Vector3<f64>)) -> Vector3<f64>| {
-            pairs.iter().map(of).sum::<Vector3<f64>>() / pairs.len() as f64
-        };
-        let (a, b) = (mean(|p| p.0), mean(|p| p.1));
+        let n = pairs.len() as f64;
+        let a = pairs.iter().map(|p| p.0).sum::<Vector3<f64>>() / n;
+        let b = pairs.iter().map(|p| p.1).sum::<Vector3<f64>>() / n;
         let (mut ab, mut aa, mut bb) = (0.0, 0.0, 0.0);
         for (x, y) in &pairs {
             ab += (x - a).dot(&(y - b));

@@ -8,6 +8,7 @@ use telemime_operator::demonstration::{Demonstration, Sample};
 use telemime_operator::tap::{TapError, latency, stops};
 use telemime_sim::hand::{swing, taps};
 
+use crate::data::skipped;
 use crate::processes::alone;
 
 type Samples = Vec<(f64, Vector3<f64>)>;
@@ -192,11 +193,7 @@ fn live_from_what_a_tracker_sends_and_enter_on_a_terminal() {
         found.is_ok_and(|out| out.status.success())
     };
     if !there_is("script") || !there_is("mkfifo") {
-        writeln!(
-            std::io::stderr(),
-            "SKIPPED tap::live…: no `script` to make a terminal"
-        )
-        .unwrap();
+        skipped("there is no `script` to make a terminal");
         return;
     }
     let _alone = alone();
@@ -207,7 +204,7 @@ fn live_from_what_a_tracker_sends_and_enter_on_a_terminal() {
         .into_iter()
         .map(|(t_s, x)| Sample::at(t_s, x.into()))
         .collect();
-    let csv = Demonstration::from_samples(&path("taps.csv"), &recording).unwrap();
+    let csv = Demonstration::from_samples(path("taps.csv"), &recording).unwrap();
     std::fs::write(path("taps.csv"), csv.to_csv()).unwrap();
     let made = Command::new("mkfifo")
         .arg(path("samples"))

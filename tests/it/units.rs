@@ -1,9 +1,9 @@
 //! The systemd units, started by a systemd of their own where this host can begin one.
 
-use std::io::Write as _;
 use std::path::Path;
 use std::process::Command;
 
+use crate::data::skipped;
 use crate::processes::alone;
 
 /// What `tests/systemd/run` ends with where something is missing.
@@ -18,11 +18,9 @@ fn systemd_starts_watches_and_stops_both_units() {
     let said = String::from_utf8_lossy(&out.stdout);
     let why = String::from_utf8_lossy(&out.stderr);
     println!("{said}");
-    // Straight to stderr: what a passing test prints by `eprintln!` nobody sees.
-    for line in why.lines().chain(said.lines()) {
-        if line.starts_with("SKIPPED") {
-            writeln!(std::io::stderr(), "{line} (the systemd units)").unwrap();
-        }
+    let lines = why.lines().chain(said.lines());
+    for reason in lines.filter_map(|line| line.strip_prefix("SKIPPED: ")) {
+        skipped(reason);
     }
     if out.status.code() != Some(SKIPPED) {
         assert!(out.status.success(), "{}\n{said}\n{why}", out.status);

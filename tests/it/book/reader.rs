@@ -353,9 +353,3 @@ pub(super) fn own_tests() -> String {
         .unwrap();
     String::from_utf8(out.stdout).unwrap()
 }
-
-/// A loud note that something was not tried.
-pub(super) fn skipped(what: &str, why: &str) {
-    // Straight to stderr: what a passing test prints by `eprintln!` nobody sees.
-    writeln!(std::io::stderr(), "SKIPPED the book's `{what}`: {why}").unwrap();
-}
