@@ -2,6 +2,7 @@
 
 import asyncio
 import hashlib
+import os
 import time
 
 from aioquic.asyncio import QuicConnectionProtocol, connect
@@ -10,7 +11,8 @@ from aioquic.quic.configuration import QuicConfiguration
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ed25519
 
-from telemime import codec, frames, greeting, messages
+import exporter
+from telemime import codec, frames, greeting, messages, pairing
 
 
 def fingerprint(certificate):
@@ -112,15 +114,76 @@ class Operator(QuicConnectionProtocol):
                     raise AssertionError(f"{message} instead of {name}")
 
 
-def dial(host, port, key, certificate, pin):
-    """An `async with` of an Operator whose robot has the pinned key."""
+class Pairing(QuicConnectionProtocol):
+    """An end of a pairing (§14): its messages, and an operator's half of what is to be done with them."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.stream, self.buffer, self.heard = None, b"", asyncio.Queue()
+
+    def quic_event_received(self, event):
+        if isinstance(event, events.StreamDataReceived):
+            self.stream = event.stream_id
+            self.buffer += event.data
+            while (found := pairing.parse(self.buffer)) is not None:
+                message, used = found
+                self.buffer = self.buffer[used:]
+                self.heard.put_nowait(message)
+        elif isinstance(event, events.ConnectionTerminated):
+            self.heard.put_nowait({"Closed": {"code": event.error_code, "reason": event.reason_phrase}})
+
+    def say(self, message, end=False):
+        if self.stream is None:
+            self.stream = self._quic.get_next_available_stream_id()
+        self._quic.send_stream_data(self.stream, pairing.encode(message), end)
+        self.transmit()
+
+    async def hear(self, name, within=10.0):
+        """The fields of the next message, which must be this one."""
+        async with asyncio.timeout(within):
+            message = await self.heard.get()
+        fields = {} if message == name else message.get(name) if isinstance(message, dict) else None
+        if fields is None:
+            raise AssertionError(f"{message} instead of {name}")
+        return fields
+
+    def peer(self):
+        """The fingerprint of the robot's key, as its handshake showed it."""
+        return fingerprint(self._quic.tls._peer_certificate)
+
+    def exported(self):
+        return exporter.export(self._quic.tls.key_schedule, b"EXPORTER-telemime-pair-1", b"", 32)
+
+    async def agree(self, name, certificate):
+        """The code for both users to compare."""
+        self.say({"Offer": {"name": name}})
+        committed, nonce = (await self.hear("Commit"))["commitment"], os.urandom(32)
+        self.say({"Nonce": {"nonce": nonce}})
+        revealed = (await self.hear("Reveal"))["nonce"]
+        assert pairing.commitment(revealed) == committed, "the robot's nonce is not the one it committed to"
+        keys = [bytes.fromhex(key) for key in (fingerprint(certificate), self.peer())]
+        return pairing.code(self.exported(), *keys, nonce, revealed)
+
+
+def configured(alpn, key, certificate, is_client=True):
     configuration = QuicConfiguration(
-        is_client=True, alpn_protocols=["telemime/1"], server_name="telemime", max_datagram_frame_size=65535, idle_timeout=5.0
+        is_client=is_client, alpn_protocols=[alpn], server_name="telemime", max_datagram_frame_size=65535, idle_timeout=5.0
     )
     configuration.certificate, configuration.private_key = certificate, key
-    # Names, dates and issuers mean nothing: the pin, below, is what is checked.
+    # Names, dates and issuers mean nothing: the pin, or the code that users compare, is what is checked.
     configuration.verify_mode = 0
-    return _Pinned(host, port, configuration, pin)
+    return configuration
+
+
+def introduce(host, port, key, certificate):
+    """An `async with` of a Pairing."""
+    configuration = configured("telemime-pair/1", key, certificate)
+    return connect(host, port, configuration=configuration, create_protocol=Pairing)
+
+
+def dial(host, port, key, certificate, pin):
+    """An `async with` of an Operator whose robot has the pinned key."""
+    return _Pinned(host, port, configured("telemime/1", key, certificate), pin)
 
 
 class _Pinned:

@@ -16,7 +16,7 @@ fn command(script: &str, first: &str) -> Option<String> {
         .output()
         .is_ok_and(|out| out.status.success())
     {
-        eprintln!("SKIPPED: no python3 here; no driver has run");
+        crate::data::skipped("no python3 here; no driver has run");
         return None;
     }
     let rig = Rig::load(&RigOptions::default()).unwrap();

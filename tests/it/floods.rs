@@ -1,5 +1,5 @@
 //! Too much of everything: handshakes, garbage, streams, frames, and a peer that never reads. The arm and whoever drives it
-//! must not notice. What it costs a robot's process in memory is measured by `tests/interop/flood.py`.
+//! must not notice. What it costs a robot's process in memory and late ticks is asserted by `tests/interop/flood.py`.
 
 use std::net::SocketAddr;
 use std::time::Duration;

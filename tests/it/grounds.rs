@@ -128,7 +128,7 @@ fn the_grounds_agree() {
 
     let kernel = experiment(dir, "netns");
     if kernel.status.code() == Some(3) {
-        println!("SKIPPED, netem was not compared: {}", lacks(&kernel));
+        crate::data::skipped(format_args!("netem was not compared: {}", lacks(&kernel)));
         return;
     }
     agree(&there, &rows(dir, "netns"), "netns", false);
@@ -152,7 +152,7 @@ fn two_namespaces_and_a_wire_agree_with_the_virtual_ground() {
     let there = rows(dir, "virtual");
     let tried = experiment(dir, "netns");
     if tried.status.code() == Some(3) {
-        println!("SKIPPED, namespaces were not tried: {}", lacks(&tried));
+        crate::data::skipped(format_args!("namespaces were not tried: {}", lacks(&tried)));
         return;
     }
     agree(&there, &rows(dir, "netns"), "netns", false);

@@ -39,7 +39,7 @@ fn the_documented_sender_drives_the_arm_by_udp_and_its_end_lets_go() {
         .status()
         .is_ok_and(|s| s.success())
     {
-        eprintln!("SKIPPED: no python3 here; no sender has run");
+        crate::data::skipped("no python3 here; no sender has run");
         return;
     }
     let _alone = alone();

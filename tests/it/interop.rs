@@ -14,7 +14,7 @@ fn the_python_implementation_agrees() {
     };
     let new_enough = "import sys; sys.exit(sys.version_info < (3, 11))";
     if !python(&["-c", new_enough]).is_ok_and(|out| out.status.success()) {
-        eprintln!("SKIPPED: no python3 of 3.11 or newer here; tests/interop has not run");
+        crate::data::skipped("no python3 of 3.11 or newer here; tests/interop has not run");
         return;
     }
     let out = python(&["-m", "unittest"]).unwrap();

@@ -1,6 +1,5 @@
 //! `sim::link` where packets are real: on the relay's sockets, and under both daemons.
 
-use std::io::Write as _;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::Path;
 use std::time::Duration;
@@ -182,11 +181,10 @@ fn a_recorded_satellite_link_has_its_delays_and_losses() {
         .arg(&packed)
         .output()
     else {
-        let _ = writeln!(
-            std::io::stderr(),
-            "SKIPPED: there is no xz to unpack {}",
+        crate::data::skipped(format_args!(
+            "there is no xz to unpack {}",
             packed.display()
-        );
+        ));
         return;
     };
     let folder = tempfile::tempdir().unwrap();
