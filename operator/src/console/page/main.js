@@ -71,6 +71,8 @@ link.addEventListener("now", ({ detail: now }) => {
   measure(now);
 });
 
+link.addEventListener("link", ({ detail: { open } }) => open || plots.silent());
+
 /** Four times a second: rates, and how far the arm is behind the hand. */
 function measure(now) {
   const { arm, sent, robot } = now;

@@ -19,6 +19,7 @@ export class Plots {
     this.rows = [];
     this.slow = matchMedia("(prefers-reduced-motion: reduce)");
     this.drawn = 0;
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => (this.fresh = true));
     this.plots = PLOTS.map((plot) => {
       const figure = document.createElement("figure");
       const caption = document.createElement("figcaption");
@@ -40,6 +41,14 @@ export class Plots {
     this.rows.push({ t, ...row });
     while (this.rows[0].t < t - SPAN_MS) this.rows.shift();
     this.fresh = true;
+  }
+
+  /** What was said last is not so any more. */
+  silent() {
+    for (const { value, canvas, name } of this.plots) {
+      value.textContent = "–";
+      canvas.setAttribute("aria-label", `${name}: unknown`);
+    }
   }
 
   draw(now) {
