@@ -50,7 +50,7 @@ fn performance(person: u64, index: u64) -> Demonstration {
             Sample::at(t_s, x.map(|v| about(v, 0.006)))
         })
         .collect();
-    Demonstration::from_samples(&format!("p{person}_{index}"), &samples).expect("samples in order")
+    Demonstration::from_samples(format!("p{person}_{index}"), &samples).expect("samples in order")
 }
 
 fn by(person: u64) -> Vec<Demonstration> {
