@@ -237,8 +237,11 @@ impl Store {
     pub(super) fn finish(self, mut rows: Vec<Row>) -> Result<(), StoreError> {
         rows.sort_by_key(|row| row.run);
         write_results(&self.dir, &rows)?;
-        let path = self.dir.join(PART);
-        std::fs::remove_file(&path).map_err(io_at(&path))
+        // The lock last, and while it is held: whoever takes what is gone sees that all is done.
+        for path in [self.dir.join(PART), self.dir.join(LOCK)] {
+            std::fs::remove_file(&path).map_err(io_at(&path))?;
+        }
+        Ok(())
     }
 }
 
