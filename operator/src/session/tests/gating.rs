@@ -2,6 +2,7 @@
 
 use super::*;
 use nalgebra::UnitQuaternion;
+use telemime_protocol::checkpoint::path::pose;
 use telemime_protocol::predict::Forecast;
 
 /// Where the newest motion says the hand is.
@@ -81,10 +82,10 @@ fn the_path_waits_for_the_truth() {
         }
         bench.session.release();
         bench.drain();
-        let path = super::mirroring::by_stream(&bench.control, 1e-3);
+        let path = super::path::by_stream(&bench.control, 1e-3);
         for (i, (t, x)) in seen.iter().enumerate() {
             let glitch = running == 2 && i < 2;
-            let off_m = (path.eval(*t).unwrap().x - x).norm();
+            let off_m = (pose::place(&path.eval(*t).unwrap().x) - x).norm();
             if glitch {
                 assert!(off_m > 0.4, "a glitch is no part of the path: {off_m}");
             } else {
