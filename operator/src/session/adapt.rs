@@ -33,10 +33,6 @@ const PRIOR: f64 = 100.0;
 /// What the mixture errs by (squared) of what was calibrated: the calibration had to learn without a demonstration.
 const WHOLE: f64 = 0.65;
 
-/// Beyond the last of [`BAND_KNOTS`] the calibration counts less by this power of how much farther: a motion that it does not fit
-/// has ended before its errors come in.
-const FARTHER_POWER: i32 = 4;
-
 /// Straight line and generic extrapolator are as calibrated until as many frames say otherwise.
 const ORDINARY: f64 = 1.0;
 
@@ -426,12 +422,10 @@ impl<C: Course> Adaptation<C> {
         let mut out = [[0.0; WEIGHTED]; BAND_KNOTS.len()];
         for (band, weights) in out.iter_mut().enumerate() {
             let record = &self.records[band];
-            // How much farther this band is judged than it is stated for.
-            let farther = self.judged[band] as f64 / BAND_KNOTS[band] as f64;
-            let counts = prior / farther.powi(FARTHER_POWER);
             let unknown = match nearer {
                 None => [UNKNOWN; WEIGHTED + 1],
                 Some(errors) => {
+                    let farther = self.judged[band] as f64 / BAND_KNOTS[band] as f64;
                     let grown = |e: f64| (e * GROWTH[band - 1] * farther).min(1e4);
                     let [mixture, generic, straight, hold] = errors;
                     [grown(mixture), grown(generic), grown(straight), hold].map(|e| CASCADE * e)
@@ -442,7 +436,7 @@ impl<C: Course> Adaptation<C> {
             let moved = record.moved().unwrap_or(hold);
             let right = RIGHT * RIGHT * (record.frames + prior);
             let errors: [f64; WEIGHTED + 1] = std::array::from_fn(|e| {
-                let calibrated = expected.map_or(0.0, |expected| counts * expected[e] / hold);
+                let calibrated = expected.map_or(0.0, |expected| prior * expected[e] / hold);
                 let before = credit * calibrated + (1.0 - credit) * unknown[e];
                 record.squared[e] + before * moved + right
             });
