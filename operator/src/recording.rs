@@ -7,7 +7,7 @@ use std::net::SocketAddr;
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_endpoint::recording::{
     self, At, Drawn, Hand, Json, Look, OperatorState, Outcome, RecordError, Tape, To, in_base,
-    info, points, warning,
+    info, points, poses, warning,
 };
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::arm::WireArm;
@@ -36,7 +36,7 @@ enum Entry {
     Hand(Hand, Stamp, Option<Placed>),
     State(Box<OperatorState>, Stamp),
     Forecast(Vec<Vector3<f64>>, Stamp),
-    Knots(Vec<Vector3<f64>>, Stamp),
+    Knots(Vec<Placed>, Stamp),
     Arm(Box<WireArm>),
     Telemetry(Box<Telemetry>, Stamp),
     Said(String, Stamp),
@@ -247,7 +247,14 @@ impl Scribe {
             let ahead = ahead.map(|p| placed(&p.position)).collect();
             self.tape.push(Entry::Forecast(ahead, now));
         }
-        let knots: Vec<_> = session.recent_knots().map(|(m, _)| placed(&m)).collect();
+        let turned = |q: UnitQuaternion<f64>| self.turned(&mapping, q);
+        let knots: Vec<_> = session
+            .recent_knots()
+            .map(|knot| Placed {
+                m: placed(&knot.x),
+                turn: knot.orientation.and_then(turned).unwrap_or_default(),
+            })
+            .collect();
         if !knots.is_empty() {
             self.tape.push(Entry::Knots(knots, now));
         }
@@ -257,10 +264,14 @@ impl Scribe {
         mapping.tip_m + mapping.scale * (self.rotation * (hand_m - mapping.hand_m))
     }
 
+    /// How the tip is to be turned when the hand is turned so, if it follows that.
+    fn turned(&self, mapping: &Mapping, q: UnitQuaternion<f64>) -> Option<UnitQuaternion<f64>> {
+        let since = q * mapping.hand_q?.inverse();
+        Some(self.rotation * since * self.rotation.inverse() * mapping.tip_q)
+    }
+
     fn placed(&self, mapping: &Mapping, sample: &HandSample) -> Placed {
-        let turn = sample.orientation.zip(mapping.hand_q).map(|(q, began)| {
-            self.rotation * (q * began.inverse()) * self.rotation.inverse() * mapping.tip_q
-        });
+        let turn = sample.orientation.and_then(|q| self.turned(mapping, q));
         Placed {
             m: self.place(mapping, &sample.x),
             turn: turn.unwrap_or(mapping.tip_q),
@@ -294,7 +305,7 @@ impl Writer {
                 tape.message("/operator/forecast", At::once(now), &ahead)
             }
             Entry::Knots(knots, now) => {
-                let knots = points(now, knots.into_iter());
+                let knots = poses(now, knots.iter().map(|at| (at.m, at.turn)));
                 tape.message("/operator/knots", At::once(now), &knots)
             }
             Entry::Arm(arm) => {

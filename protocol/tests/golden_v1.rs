@@ -67,6 +67,7 @@ fn operator_control() {
             scale: 0.125,
             rotation: [0.5, -0.5, 0.5, 0.5],
             path_bound_um: 20_000,
+            path_turn_bound_urad: 0,
             sample_us: 33_333,
             lease_ms: 650,
         })
@@ -95,17 +96,17 @@ fn operator_control() {
         (
             engage(mirror(WirePose::default())),
             "0203fc0ead250000fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28ce3c7f8000fb1032ff90c81e14963c2864501e0000 \
-             0000003e0000003f000000bf0000003f0000003ffb204efb3582fb8a02",
+             0000003e0000003f000000bf0000003f0000003ffb204e00fb3582fb8a02",
         ),
         (
             engage(mirror(POSE)),
             "0203fc0ead250000fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28ce3c7f8000fb1032ff90c81e14963c2864501e \
              01fb204efb6ff500140a010203fffefd7f8000050607ff90c81e14963c2864501e0164 \
-             0000003e0000003f000000bf0000003f0000003ffb204efb3582fb8a02",
+             0000003e0000003f000000bf0000003f0000003ffb204e00fb3582fb8a02",
         ),
         (
             engage(Drive::Play { plan: 300 }),
-            "0203fc0ead250001fb2c010000003e0000003f000000bf0000003f0000003ffb204efb3582fb8a02",
+            "0203fc0ead250001fb2c010000003e0000003f000000bf0000003f0000003ffb204e00fb3582fb8a02",
         ),
         (
             OperatorControl::Path(PathTail {

@@ -6,7 +6,9 @@ use nalgebra::Vector3;
 use proptest::collection::vec;
 use proptest::option;
 use proptest::prelude::*;
-use telemime_protocol::checkpoint::path::{PathGrid, PathKnot};
+use telemime_protocol::checkpoint::path::{
+    MAX_TURN_URAD, PathBounds, PathGrid, PathKnot, PoseKnot,
+};
 use telemime_protocol::predict::{HandState, Params};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::DecodeError;
@@ -96,12 +98,13 @@ fn engage() -> impl Strategy<Value = Engage> {
         drive,
         1e-6..10.0f32,
         unit(),
-        1..=u32::MAX,
+        (1..=u32::MAX, 0..=MAX_TURN_URAD),
         1..=MAX_SAMPLE_US,
         any::<u16>(),
     )
         .prop_map(
-            |(engagement, t_us, drive, scale, rotation, path_bound_um, sample_us, lease_ms)| {
+            |(engagement, t_us, drive, scale, rotation, bounds, sample_us, lease_ms)| {
+                let (path_bound_um, path_turn_bound_urad) = bounds;
                 Engage {
                     engagement,
                     t_us,
@@ -109,6 +112,7 @@ fn engage() -> impl Strategy<Value = Engage> {
                     scale,
                     rotation,
                     path_bound_um,
+                    path_turn_bound_urad,
                     sample_us,
                     lease_ms,
                 }
@@ -273,17 +277,12 @@ fn arm() -> impl Strategy<Value = RobotControl> {
     })
 }
 
-const CODE_BOUND_M: f64 = 0.02;
-
 fn code(sample_us: u32) -> PathCode {
-    PathCode {
-        grid: PathGrid::for_bound(CODE_BOUND_M).expect("a grid"),
-        sample_us,
-    }
+    PathCode::new(PathBounds::new(0.02, None), sample_us).expect("a grid")
 }
 
 /// A path: knots as an encoder makes them, some of them wild, all after the epoch.
-fn knots(most: usize) -> impl Strategy<Value = Vec<PathKnot>> {
+fn knots(most: usize) -> impl Strategy<Value = Vec<PoseKnot>> {
     let small = prop::array::uniform6(-40..40i32);
     let any = prop::array::uniform6(-(1i32 << 30)..=1i32 << 30);
     let dt = prop_oneof![
@@ -312,7 +311,7 @@ fn knots(most: usize) -> impl Strategy<Value = Vec<PathKnot>> {
             let v = [p, q, r].map(|v| v >> shift << shift);
             knots.push(PathKnot { tick, x, v, start });
         }
-        knots
+        knots.into_iter().map(PoseKnot::from).collect()
     })
 }
 
@@ -714,11 +713,13 @@ fn weights_of_more_than_all_are_refused() {
 
 #[test]
 fn counts_beyond_their_limits_are_refused() {
-    let knot = |n: i64| PathKnot {
-        tick: 3_333 * (n - 2_000),
-        x: [1; 3],
-        v: [0; 3],
-        start: n == 0,
+    let knot = |n: i64| {
+        PoseKnot::from(PathKnot {
+            tick: 3_333 * (n - 2_000),
+            x: [1; 3],
+            v: [0; 3],
+            start: n == 0,
+        })
     };
     let block = |knots: usize| {
         let knots: Vec<_> = (0..knots as i64).map(knot).collect();

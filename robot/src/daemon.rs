@@ -10,6 +10,7 @@ use quinn::{Connection, Endpoint, VarInt};
 use telemime_endpoint::cli::{Word, told};
 use telemime_endpoint::control::{ControlError, Writer};
 use telemime_endpoint::{External, Fingerprint, HostClock, Mono, Trust, logs, quic};
+use telemime_protocol::checkpoint::path::{DecodedKnot, POSE, pose as on_path};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::wire::Version;
 use telemime_protocol::wire::arm::WireArm;
@@ -109,9 +110,19 @@ pub enum Notice {
     Pairing(Progress),
     /// A servo tick, for recording.
     Report(Box<Report>),
-    /// The path an engagement received, as it stands when the session ends: time (s, session clock), m, m/s, and
-    /// whether it starts afresh there, not joined to the knot before.
-    Path(Vec<(f64, [f64; 3], [f64; 3], bool)>),
+    /// The path an engagement received, as it stands when the session ends.
+    Path(Vec<PathPoint>),
+}
+
+/// A knot of a path: time (s, session clock), m, m/s, whether it starts afresh there, not joined to the knot before,
+/// and, if the path carries the hand's orientation, that as a point of ℝ⁴ (w, x, y, z) and what it changes by in a
+/// second.
+pub type PathPoint = (f64, [f64; 3], [f64; 3], bool, Option<[[f64; 4]; 2]>);
+
+fn path_point(knot: &DecodedKnot<POSE>, start: bool, turns: bool) -> PathPoint {
+    let turn = turns.then(|| [&knot.x, &knot.v].map(|p| on_path::turn_point(p).into()));
+    let (x, v) = (on_path::place(&knot.x), on_path::place(&knot.v));
+    (knot.t.as_secs_f64(), x.into(), v.into(), start, turn)
 }
 
 struct Active {
@@ -425,7 +436,7 @@ impl Daemon {
         }
         if let Some(mirror) = ended.mirror() {
             let knots = mirror.path().marked();
-            let knots = knots.map(|(k, start)| (k.t.as_secs_f64(), k.x.into(), k.v.into(), start));
+            let knots = knots.map(|(k, start)| path_point(k, start, mirror.turns()));
             let _ = notices.send(Notice::Path(knots.collect()));
         }
         let now = self.clock.now();

@@ -119,19 +119,11 @@ pub(super) fn live(of: &Recording, bound_m: f64) -> anyhow::Result<Coded> {
         // NaN shows in the table: there is no such sample.
         decoder.eval(on_tick).map_or(x * f64::NAN, |jet| jet.x)
     });
-    let spans = (of.t.len() - 1) as f64;
-    let interval_us = (of.duration_s() / spans * 1e6).round().max(1.0) as u32;
-    let block_len = |length: usize| {
-        let blocks = knots.chunks(length).enumerate();
-        blocks
-            .map(|(i, block)| block_bytes(interval_us, &knots[..i * length], block))
-            .sum::<Option<usize>>()
-            .context("a knot that cannot travel")
-    };
+    let (bytes, whole_bytes) = live_bytes(&of.t, &knots)?;
     Ok(Coded {
         points: knots.len(),
-        bytes: block_len(MAX_TAIL_KNOTS)?,
-        whole_bytes: block_len(KNOTS_A_MESSAGE)?,
+        bytes,
+        whole_bytes,
         decoded: decoded.collect(),
     })
 }
@@ -139,8 +131,29 @@ pub(super) fn live(of: &Recording, bound_m: f64) -> anyhow::Result<Coded> {
 /// About the knots of a hand that a message brings.
 const KNOTS_A_MESSAGE: usize = 2;
 
+/// What the knots of a hand sampled at `t` take in one block, as by the stream, and in a block for every two.
+pub(super) fn live_bytes<const D: usize>(
+    t: &[f64],
+    knots: &[PathKnot<D>],
+) -> anyhow::Result<(usize, usize)> {
+    let spans = (t.len() - 1) as f64;
+    let interval_us = ((t[t.len() - 1] - t[0]) / spans * 1e6).round().max(1.0) as u32;
+    let bytes = |length: usize| {
+        let blocks = knots.chunks(length).enumerate();
+        blocks
+            .map(|(i, block)| block_bytes(interval_us, &knots[..i * length], block))
+            .sum::<Option<usize>>()
+            .context("a knot that cannot travel")
+    };
+    Ok((bytes(MAX_TAIL_KNOTS)?, bytes(KNOTS_A_MESSAGE)?))
+}
+
 /// A block of knots as in the protocol's §8, with its length.
-fn block_bytes(interval_us: u32, before: &[PathKnot], block: &[PathKnot]) -> Option<usize> {
+fn block_bytes<const D: usize>(
+    interval_us: u32,
+    before: &[PathKnot<D>],
+    block: &[PathKnot<D>],
+) -> Option<usize> {
     let first = block.first()?;
     let origin = Origin {
         tick: first.tick,

@@ -10,10 +10,11 @@ use std::path::PathBuf;
 use anyhow::{Context, bail};
 use serde::Serialize;
 use telemime_operator::demonstration::{Demonstration, Demonstrations};
+use telemime_protocol::checkpoint::path::PathBounds;
 
 use coders::Recording;
 use compare::Row;
-use turns::TurnRow;
+use turns::{PoseRow, TurnRow};
 
 /// Compress recordings within an error bound, and compare: checkpoints, bytes, errors, R².
 ///
@@ -59,6 +60,7 @@ struct Study {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     same_points: Vec<Row>,
     orientation: Option<TurnRow>,
+    pose_live: Option<PoseRow>,
     /// Each bound of the figure, m, with its rows.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     sweep: Vec<(f64, Vec<Row>)>,
@@ -100,6 +102,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             None => Vec::new(),
         },
         orientation: turns::code(&demonstrations, args.turn_bound)?,
+        pose_live: turns::live(
+            &demonstrations,
+            PathBounds::new(args.bound, Some(args.turn_bound)),
+        )?,
         sweep: Vec::new(),
     };
     if let Some(path) = &args.figure {
@@ -217,6 +223,18 @@ fn text(study: &Study) -> String {
             turn.largest_error_rad,
             turn.rms_error_rad,
             turn.recordings
+        ));
+    }
+    if let Some(pose) = &study.pose_live {
+        line(format!(
+            "place and orientation together, live: {} knots, {} bytes in one block, {} in twos, {:.1} bytes/s, 1/{:.1} of eight f32 a sample, max {:.3} mm and {:.5} rad",
+            pose.knots,
+            pose.bytes,
+            pose.bytes_in_twos,
+            pose.bytes as f64 / pose.duration_s,
+            pose.raw_bytes as f64 / pose.bytes as f64,
+            pose.largest_error_m * 1e3,
+            pose.largest_error_rad
         ));
     }
     out

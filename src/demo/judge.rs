@@ -9,6 +9,7 @@ use telemime_protocol::checkpoint::path::DecodedKnot;
 use telemime_protocol::spline::HermiteSpan;
 use telemime_protocol::time::Stamp;
 use telemime_robot::cli::Event as Robot;
+use telemime_robot::daemon::PathPoint as HeldKnot;
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo::{Mapping, RAMP_S};
 
@@ -289,7 +290,7 @@ fn received_path(run: &Run) -> Vec<PathPoint> {
             None
         }
     });
-    let decode = |(t_s, x, v, start): &(f64, [f64; 3], [f64; 3], bool)| {
+    let decode = |(t_s, x, v, start, _): &HeldKnot| {
         let knot = DecodedKnot {
             t: Stamp::from_secs_f64(*t_s),
             x: Vector3::from(*x),

@@ -140,7 +140,7 @@ class Hand:
             "state": self.state.wire(), "model": 0, "params": CONSTANT_VELOCITY, "pose": {"turn": None, "grip": None}}}  # fmt: skip
         return {"Engage": {
             "engagement": self.engagement, "t_us": self.operator.clock_us(), "drive": drive, "scale": self.scale,
-            "rotation": [1.0, 0.0, 0.0, 0.0], "path_bound_um": BOUND_UM, "sample_us": SAMPLE_US, "lease_ms": LEASE_MS,
+            "rotation": [1.0, 0.0, 0.0, 0.0], "path_bound_um": BOUND_UM, "path_turn_bound_urad": 0, "sample_us": SAMPLE_US, "lease_ms": LEASE_MS,
         }}  # fmt: skip
 
     async def move(self, seconds):

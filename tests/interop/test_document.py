@@ -43,7 +43,7 @@ class Document(unittest.TestCase):
 
     def test_messages(self):
         kinds = {
-            "operator control": "engage-mirror engage-play path reset",
+            "operator control": "engage-mirror engage-play path path-pose reset",
             "robot control": "info engaged refused state arm",
             "operator datagram": "motion motion-pose go go-bend pong stop clock",
             "robot datagram": "ping telemetry reception",
@@ -121,6 +121,13 @@ class Document(unittest.TestCase):
         x, v = path.evaluate(*knots, grid, 2_500_000_000)
         self.near(says["path x(2.5)"], x)
         self.near(says["path v(2.5)"], v)
+        grid = path.Grid(20_000, 33_333, 50_000)
+        m = messages.read("operator control", document.example("path-pose"))["Path"]
+        poses = path.decode(m["state"], m["knots"], grid)
+        self.assertEqual([k.x[:3] for k in poses], [k.x for k in (*knots, last)])
+        self.assertEqual(path.encode(m["state"], poses, grid), m["knots"])
+        x, _ = path.evaluate(*poses[:2], grid, 2_500_000_000)
+        self.near(document.numbers("path-pose")["path q(2.5)"], path.orientation(x))
 
     def test_plan(self):
         says = document.numbers("plan")

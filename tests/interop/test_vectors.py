@@ -144,7 +144,7 @@ class Vectors(unittest.TestCase):
 
     def test_paths(self):
         for data, value in self.each("path"):
-            grid = path.Grid(value["path_bound_um"], value["sample_us"])
+            grid = path.Grid(value["path_bound_um"], value["sample_us"], value["path_turn_bound_urad"])
             m = messages.read("operator control", data)["Path"]
             knots = [path.Knot(*k) for k in value["knots"]]
             held, sent = knots[: value["before"]], knots[value["before"] :]
@@ -154,7 +154,9 @@ class Vectors(unittest.TestCase):
             joined = [(a, b) for a, b in zip(knots, knots[1:]) if not b.start]
             for (a, b), at in zip(joined, value["at"], strict=True):
                 x, v = path.evaluate(a, b, grid, at["t_ns"])
-                self.near([at["x"], at["v"]], [x, v])
+                self.near([at["x"], at["v"]], [x[:3], v[:3]])
+                if at["q"] is not None:
+                    self.near(at["q"], path.orientation(x))
 
     def test_plans(self):
         for data, value in self.each("plan"):

@@ -86,6 +86,7 @@ fn values() -> BTreeMap<&'static str, [&'static str; 3]> {
         ("gain", ["0.1", "0.2", "0.3"]),
         ("future_bound", ["\"10mm\"", "20mm", "2sigma"]),
         ("path_bound_m", ["0.01", "0.02", "0.03"]),
+        ("path_turn_bound_rad", ["0.01", "0.02", "0.03"]),
         ("max_silence_s", ["0.1", "0.15", "0.2"]),
         ("min_interval_s", ["0.01", "0.02", "0.03"]),
         ("lease_s", ["0.5", "0.6", "0.7"]),

@@ -6,7 +6,7 @@ use telemime::measure::{Hand, Track, follow, rmse_m, sample_and_hold};
 use telemime_operator::daemon::{Notice, Summary};
 use telemime_operator::task::Outcome;
 use telemime_protocol::spline::HermiteSpan;
-use telemime_robot::daemon::Notice as RobotNotice;
+use telemime_robot::daemon::{Notice as RobotNotice, PathPoint};
 use telemime_robot::rig::Rig;
 use telemime_robot::servo::Report;
 use telemime_sim::link::Link;
@@ -41,9 +41,8 @@ fn run(rig: &Rig, seed: u64) -> Run {
             RobotNotice::Path(path) => Some(path.clone()),
             _ => None,
         });
-        let from_zero = |(t_s, x, v, _): (f64, [f64; 3], [f64; 3], bool)| {
-            (t_s - session_zero.as_secs_f64(), x.into(), v.into())
-        };
+        let from_zero =
+            |(t_s, x, v, ..): PathPoint| (t_s - session_zero.as_secs_f64(), x.into(), v.into());
         Run {
             reports: pair.robot.reports().clone(),
             zero: pair.to_mono(session_zero).0,

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use nalgebra::{SMatrix, SVector, UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
-use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid, PathKnot};
+use telemime_protocol::checkpoint::path::{PathBounds, PathDecoder, PoseKnot, pose as on_path};
 use telemime_protocol::checkpoint::{Checkpoint, Grid, Plan, PosePlan};
 use telemime_protocol::pose;
 use telemime_protocol::predict::{
@@ -85,32 +85,37 @@ const BEND: WireBend = WireBend {
 const TIP_Q: WireRotation = WireRotation([7_869, -3_976, 0]);
 
 /// Two of them in the motion, the third by the stream.
-const KNOTS: [PathKnot; 3] = [
-    PathKnot {
+const KNOTS: [PoseKnot; 3] = [
+    PoseKnot {
         tick: 240_000,
-        x: [35, -20, 250],
-        v: [2, -4, 0],
+        x: [35, -20, 250, 78, 16, -10, 0],
+        v: [2, -4, 0, 0, 2, 0, -2],
         start: true,
     },
-    PathKnot {
+    PoseKnot {
         tick: 270_000,
-        x: [40, -20, 251],
-        v: [0, 2, 0],
+        x: [40, -20, 251, 77, 19, -12, -1],
+        v: [0, 2, 0, 0, 2, 0, 0],
         start: false,
     },
-    PathKnot {
+    PoseKnot {
         tick: 280_002,
-        x: [43, -21, 251],
-        v: [16, 0, -8],
+        x: [43, -21, 251, 77, 20, -12, -1],
+        v: [16, 0, -8, 0, 0, 0, 0],
         start: false,
     },
 ];
 
-fn code() -> PathCode {
-    PathCode {
-        grid: PathGrid::for_bound(0.02).unwrap(),
-        sample_us: 33_333,
-    }
+fn places() -> [PoseKnot; 3] {
+    KNOTS.map(|knot| knot.place().into())
+}
+
+fn pose_code() -> PathCode {
+    code(Some(0.05))
+}
+
+fn code(turn_rad: Option<f64>) -> PathCode {
+    PathCode::new(PathBounds::new(0.02, turn_rad), 33_333).unwrap()
 }
 
 fn motion(checksum: Option<u32>) -> Motion {
@@ -125,7 +130,7 @@ fn motion(checksum: Option<u32>) -> Motion {
         state: STATE,
         pose: WirePose::default(),
         first_knot: 0,
-        knots: KnotBlock::pack(&STATE, code(), &[], &KNOTS[..2]).unwrap(),
+        knots: KnotBlock::pack(&STATE, code(None), &[], &KNOTS[..2]).unwrap(),
     }
 }
 
@@ -302,6 +307,7 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
             scale: 0.125,
             rotation,
             path_bound_um: 20_000,
+            path_turn_bound_urad: 0,
             sample_us: 33_333,
             lease_ms: 650,
         })
@@ -346,7 +352,16 @@ fn bytes() -> BTreeMap<&'static str, Vec<u8>> {
                 engagement: 1,
                 state: STATE,
                 first_knot: 2,
-                knots: KnotBlock::pack(&STATE, code(), &KNOTS[..2], &KNOTS[2..]).unwrap(),
+                knots: KnotBlock::pack(&STATE, code(None), &KNOTS[..2], &KNOTS[2..]).unwrap(),
+            })),
+        ),
+        (
+            "path-pose",
+            message(&OperatorControl::Path(PathTail {
+                engagement: 1,
+                state: STATE,
+                first_knot: 0,
+                knots: KnotBlock::pack(&STATE, pose_code(), &[], &KNOTS).unwrap(),
             })),
         ),
         ("reset", message(&OperatorControl::Reset { changes: 9 })),
@@ -603,16 +618,23 @@ fn values() -> BTreeMap<String, String> {
         format!("{:08x}", checksum(&forecast, None)),
     );
 
-    let mut path = PathDecoder::new(code().grid, 8);
-    let knots = motion(None)
-        .knots
-        .unpack(&STATE, code(), &[], v1::MAX_KNOTS);
+    let code = code(None);
+    let mut path = PathDecoder::new(code.grid(), 8);
+    let knots = motion(None).knots.unpack(&STATE, code, &[], v1::MAX_KNOTS);
     let knots = knots.unwrap();
-    assert_eq!(knots, KNOTS[..2]);
+    assert_eq!(knots, places()[..2]);
     knots.iter().for_each(|knot| path.append(knot).unwrap());
     let jet = path.eval(Stamp(2_500_000_000)).unwrap();
-    say("path x(2.5)", vector(&jet.x));
-    say("path v(2.5)", vector(&jet.v));
+    say("path x(2.5)", vector(&on_path::place(&jet.x)));
+    say("path v(2.5)", vector(&on_path::place(&jet.v)));
+    let mut path = PathDecoder::new(pose_code().grid(), 8);
+    KNOTS.iter().for_each(|knot| path.append(knot).unwrap());
+    let jet = path.eval(Stamp(2_500_000_000)).unwrap();
+    let q = on_path::turn(&jet.x).unwrap();
+    say(
+        "path q(2.5)",
+        format!("{:.9} {:.9} {:.9} {:.9}", q.w, q.i, q.j, q.k),
+    );
 
     let jet = plan().position().spline().unwrap().eval(0.1).unwrap();
     say("plan x(0.1)", vector(&jet.x));
@@ -740,6 +762,7 @@ fn a_plan_that_does_not_begin_at_zero_is_refused() {
         scale: 0.1,
         rotation: [1.0, 0.0, 0.0, 0.0],
         path_bound_um: 1000,
+        path_turn_bound_urad: 0,
         sample_us: 33_333,
         lease_ms: 650,
     }));

@@ -29,7 +29,7 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::hello::{Answer, Hello};
 use telemime_protocol::wire::v1::{RobotState, VERSION};
 use telemime_robot::control::ControlConfig;
-use telemime_robot::daemon::Notice as RobotNotice;
+use telemime_robot::daemon::{Notice as RobotNotice, PathPoint};
 use telemime_robot::door;
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_sim::link::LinkConfig;
@@ -63,8 +63,8 @@ const MOST_QUEUED: usize = 400;
 /// Connections an endpoint keeps anything of: attempts that overlap, and those that QUIC drains.
 const MOST_CONNECTIONS: usize = 64;
 
-/// What the robot held of a path: time (s, session clock), m, m/s, and whether it starts afresh there.
-type Path = Vec<(f64, [f64; 3], [f64; 3], bool)>;
+/// What the robot held of a path.
+type Path = Vec<PathPoint>;
 
 /// An operator at work, and what it has been heard to say.
 struct Driver {

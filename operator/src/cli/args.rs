@@ -1,5 +1,6 @@
 //! The flags, and what a session makes of them.
 
+use std::f64::consts::PI;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -125,6 +126,10 @@ pub struct Args {
     /// ε_path, m: the robot's record of the path is that exact [default: 2 % of the skill's reach].
     #[arg(long, value_name = "M")]
     pub path_bound: Option<f64>,
+    /// The same of the hand's orientation, where it has one, rad, up to half a turn; 0: the path is of the place only
+    /// [default: 0.05].
+    #[arg(long, value_name = "RAD")]
+    pub path_turn_bound: Option<f64>,
     /// The operator speaks at least this often, s [default: 0.2].
     #[arg(long, value_name = "S")]
     pub max_silence: Option<f64>,
@@ -284,6 +289,7 @@ impl Args {
             lease_s: self.lease.unwrap_or(defaults.lease_s),
             future_bound: self.future_bound.unwrap_or(defaults.future_bound),
             path_bound_m: self.path_bound.or(page.then_some(CONSOLE_PATH_BOUND_M)),
+            path_turn_bound_rad: self.path_turn_bound.unwrap_or(defaults.path_turn_bound_rad),
             input_latency_s: self.input_latency.unwrap_or(0.0),
             glitch_gate: self.glitch_gate,
             gain: self.gain.unwrap_or(defaults.gain),
@@ -316,6 +322,8 @@ impl Args {
         if let Some(bound_m) = config.path_bound_m {
             within("--path-bound", bound_m, 0.0, 10.0)?;
         }
+        let turn_rad = config.path_turn_bound_rad;
+        within("--path-turn-bound", turn_rad, -f64::EPSILON, PI)?;
         Ok(config)
     }
 }

@@ -69,6 +69,7 @@ struct File {
     gain: Option<f64>,
     future_bound: Option<String>,
     path_bound_m: Option<f64>,
+    path_turn_bound_rad: Option<f64>,
     max_silence_s: Option<f64>,
     min_interval_s: Option<f64>,
     lease_s: Option<f64>,
@@ -140,6 +141,13 @@ impl Settings for Args {
                 new("gain", "gain", Kind::Number, "1.0").or(session.gain),
                 new("future_bound", "future-bound", Kind::Text, "\"1sigma\"").or("1sigma"),
                 new("path_bound_m", "path-bound", Kind::Number, "0.01"),
+                new(
+                    "path_turn_bound_rad",
+                    "path-turn-bound",
+                    Kind::Number,
+                    "0.05",
+                )
+                .or(session.path_turn_bound_rad),
                 new("max_silence_s", "max-silence", Kind::Number, "0.2").or(session.max_silence_s),
                 new("min_interval_s", "min-interval", Kind::Number, "0.01")
                     .or(session.min_interval_s),
@@ -250,6 +258,7 @@ impl Settings for Args {
         self.gain = self.gain.or(file.gain);
         self.future_bound = self.future_bound.or(bound);
         self.path_bound = self.path_bound.or(file.path_bound_m);
+        self.path_turn_bound = self.path_turn_bound.or(file.path_turn_bound_rad);
         self.max_silence = self.max_silence.or(file.max_silence_s);
         self.min_interval = self.min_interval.or(file.min_interval_s);
         self.lease = self.lease.or(file.lease_s);

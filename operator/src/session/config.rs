@@ -28,6 +28,8 @@ pub struct SessionConfig {
     pub future_bound: FutureBound,
     /// ε_path, m; `None` is 2 % of the skill's reach.
     pub path_bound_m: Option<f64>,
+    /// The same for the orientation, where the hand has one, rad; 0: the path carries the place only.
+    pub path_turn_bound_rad: f64,
     /// The input's own latency, s: how long after it was valid a sample is handed over. It is subtracted from the sample's time.
     pub input_latency_s: f64,
     /// What a tracker gets wrong for a frame or two is replaced by its prediction. For trackers that do: a hand that
@@ -53,6 +55,7 @@ impl Default for SessionConfig {
             lease_s: 0.65,
             future_bound: FutureBound::Relative(1.0),
             path_bound_m: None,
+            path_turn_bound_rad: 0.05,
             input_latency_s: 0.0,
             glitch_gate: false,
             gain: 1.0,

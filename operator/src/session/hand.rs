@@ -24,7 +24,7 @@ impl Hand {
     /// The hand after its first sample; `None` if that is not finite.
     pub(super) fn first(sample: &HandSample) -> Option<Self> {
         let finite = sample.x.iter().all(|v| v.is_finite());
-        let turn = sample.orientation.filter(is_rotation);
+        let turn = rotation(sample);
         finite.then(|| Self {
             since: sample.t,
             place: HandState::first(sample.t, sample.x),
@@ -39,7 +39,7 @@ impl Hand {
         if !self.place.advance(sample.t, sample.x) {
             return false;
         }
-        let seen = sample.orientation.filter(is_rotation);
+        let seen = rotation(sample);
         match &mut self.turn {
             Some(turn) => {
                 turn.advance(sample.t, seen.unwrap_or(turn.q));
@@ -75,9 +75,11 @@ impl Interval {
     }
 }
 
-/// Written so that NaN fails too.
-fn is_rotation(q: &UnitQuaternion<f64>) -> bool {
-    (q.coords.norm_squared() - 1.0).abs() < 1e-3
+/// The sample's orientation, if it is one.
+pub(super) fn rotation(sample: &HandSample) -> Option<UnitQuaternion<f64>> {
+    // Written so that NaN fails too.
+    let is_one = |q: &UnitQuaternion<f64>| (q.coords.norm_squared() - 1.0).abs() < 1e-3;
+    sample.orientation.filter(is_one)
 }
 
 fn grip(sample: &HandSample) -> Option<f64> {

@@ -1,27 +1,18 @@
 //! Mirror: dual prediction for the future, the live path coder for the past.
 
-use std::collections::VecDeque;
-
-use nalgebra::Vector3;
+use nalgebra::{UnitQuaternion, Vector3};
 use telemime_protocol::checkpoint::CheckpointError;
-use telemime_protocol::checkpoint::path::{CONTEXT, PathEncoder, PathKnot};
+use telemime_protocol::checkpoint::path::PathBounds;
 use telemime_protocol::predict::{Forecast, HandState, Params, TurnState, checksum};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
-use telemime_protocol::wire::knots::{KnotBlock, PathCode};
-use telemime_protocol::wire::state::WireState;
-use telemime_protocol::wire::v1::{Drive, MAX_TAIL_KNOTS, Motion, PathTail, model_tag};
+use telemime_protocol::wire::v1::{Drive, Motion, PathTail, model_tag};
 
 use super::adapt::Adaptation;
 use super::gate::Taken;
-use super::hand::{Hand, Known, Travelling};
+use super::hand::{Hand, Known, Travelling, rotation};
+use super::path::{Path, ShownKnot};
 use super::{FutureBound, HandSample};
-
-/// Knots in one message; the oldest unacknowledged first.
-const KNOTS_PER_MESSAGE: usize = 24;
-
-/// More unacknowledged knots than this go by the stream at once: nothing of the path is ever given up.
-const BACKLOG: usize = 256;
 
 /// Every so many messages the robot's prediction is checked against ours.
 const KEYFRAME: u32 = 8;
@@ -38,26 +29,13 @@ const TURN_SIGMAS: f64 = 0.6;
 /// A gripper is told of changes above this, in steps of 1/255.
 const GRIP_STEPS: u8 = 4;
 
-/// A knot that is still not acknowledged after the round trip and this long goes again, s.
-const PATIENCE_S: f64 = 0.15;
-
 /// What is kept of an engagement, in samples: half an hour of a tracker of 60 Hz. What comes later is not.
 const MOST_DRIVEN: usize = 108_000;
-
-/// Knots that are shown.
-const SHOWN_KNOTS: usize = 48;
 
 /// A sample that its prediction stands for, for the time being.
 struct Suspect {
     seen: HandSample,
-    instead: Vector3<f64>,
-}
-
-/// A knot the robot may not have yet.
-struct Unacknowledged {
-    knot: PathKnot,
-    copies: u8,
-    sent: Stamp,
+    instead: (Vector3<f64>, Option<UnitQuaternion<f64>>),
 }
 
 /// A live engagement.
@@ -67,14 +45,7 @@ pub(super) struct Mirror {
     judged: Hand,
     suspects: Vec<Suspect>,
     driven: Vec<HandSample>,
-    path: PathEncoder,
-    code: PathCode,
-    /// The last knots the robot holds: those to come are written with them in mind.
-    held: VecDeque<PathKnot>,
-    unacknowledged: VecDeque<Unacknowledged>,
-    first_unacknowledged: u32,
-    /// The newest knots, for display.
-    shown: VecDeque<Vector3<f64>>,
+    path: Path,
     places: Adaptation<HandState>,
     turns: Adaptation<TurnState>,
     without_model: bool,
@@ -84,16 +55,14 @@ pub(super) struct Mirror {
 }
 
 impl Mirror {
-    /// `path` is its bound, m, and the interval of the samples, µs.
+    /// `path` is its bounds and the interval of the samples, µs.
     pub(super) fn new(
         hand: Hand,
-        (path_bound_m, sample_us): (f64, u32),
+        (bounds, sample_us): (PathBounds, u32),
         gain: f64,
         skill: Option<&Skill>,
     ) -> Result<Self, CheckpointError> {
-        // The bound both ends derive their grid from is a whole number of µm.
-        let path_bound_m = (path_bound_m * 1e6).round() * 1e-6;
-        let path = PathEncoder::new(path_bound_m)?;
+        let path = Path::new(bounds, sample_us, hand.turn.map(|turn| turn.q))?;
         // A hand that was seen to rest has not begun anything, and the arm must not begin it either.
         let seen_s = hand.place.t.secs_since(hand.since);
         let places = Adaptation::of_places(
@@ -114,15 +83,7 @@ impl Mirror {
             judged: hand,
             suspects: Vec::new(),
             driven: Vec::new(),
-            code: PathCode {
-                grid: path.grid(),
-                sample_us,
-            },
             path,
-            held: VecDeque::with_capacity(CONTEXT + 1),
-            unacknowledged: VecDeque::new(),
-            first_unacknowledged: 0,
-            shown: VecDeque::with_capacity(SHOWN_KNOTS),
             places,
             turns,
             // The robot ends with the model it began with, so a model that arrives now is for the next engagement.
@@ -154,27 +115,17 @@ impl Mirror {
 
     /// The robot holds every knot before `frontier`.
     pub(super) fn acknowledge(&mut self, frontier: u32) {
-        let known = frontier.saturating_sub(self.first_unacknowledged) as usize;
-        let known = known.min(self.unacknowledged.len());
-        for gone in self.unacknowledged.drain(..known) {
-            self.held.push_back(gone.knot);
-            if self.held.len() > CONTEXT {
-                self.held.pop_front();
-            }
-        }
-        self.first_unacknowledged += known as u32;
+        self.path.acknowledge(frontier);
+    }
+
+    /// The newest knots.
+    pub(super) fn recent_knots(&self) -> impl Iterator<Item = ShownKnot> {
+        self.path.shown()
     }
 
     /// What the robot predicts from.
     pub(super) fn told(&self) -> Option<Forecast> {
         self.sent.map(|sent| sent.place)
-    }
-
-    /// The newest knots, and whether the robot holds them.
-    pub(super) fn recent_knots(&self) -> impl Iterator<Item = (Vector3<f64>, bool)> {
-        let held = self.shown.len().saturating_sub(self.unacknowledged.len());
-        let numbered = self.shown.iter().enumerate();
-        numbered.map(move |(i, x)| (*x, i < held))
     }
 
     /// From now on.
@@ -212,7 +163,7 @@ impl Mirror {
         if taken == Taken::Replaced {
             self.suspects.push(Suspect {
                 seen: *sample,
-                instead: hand.place.x,
+                instead: (hand.place.x, hand.turn.map(|turn| turn.q)),
             });
             let skill = skill.filter(|_| !self.without_model);
             self.newest = self.travelling().map(|t| t.known(skill));
@@ -229,14 +180,20 @@ impl Mirror {
         self.newest = self.travelling().map(|t| t.known(skill));
         let knots = self.settle(taken == Taken::Rewritten);
         self.record(sample);
-        knots + self.trace(hand.place.t, hand.place.x)
+        let q = hand.turn.map(|turn| turn.q);
+        knots + self.path.push(hand.place.t, &hand.place.x, q)
     }
 
     /// What the suspects were is known: the hand's doing, or glitches. Returns how many knots that made.
     fn settle(&mut self, real: bool) -> u32 {
         let mut knots = 0;
         for Suspect { seen, instead } in std::mem::take(&mut self.suspects) {
-            knots += self.trace(seen.t, if real { seen.x } else { instead });
+            let (x, q) = if real {
+                (seen.x, rotation(&seen))
+            } else {
+                instead
+            };
+            knots += self.path.push(seen.t, &x, q);
             if real {
                 self.record(&seen);
             }
@@ -250,60 +207,19 @@ impl Mirror {
         }
     }
 
-    fn trace(&mut self, t: Stamp, x: Vector3<f64>) -> u32 {
-        // A sample the path cannot hold (out of the grid's range) is still good for the future.
-        let Ok(Some(knot)) = self.path.push(t, x) else {
-            return 0;
-        };
-        self.hold(knot);
-        1
-    }
-
-    fn hold(&mut self, knot: PathKnot) {
-        if self.shown.len() == SHOWN_KNOTS {
-            self.shown.pop_front();
-        }
-        let step_m = self.code.grid.step_m();
-        self.shown
-            .push_back(Vector3::from(knot.x.map(|x| f64::from(x) * step_m)));
-        self.unacknowledged.push_back(Unacknowledged {
-            knot,
-            copies: 0,
-            sent: self.hand.place.t,
-        });
-    }
-
     /// What goes by the stream because datagrams have not delivered it for too long.
     pub(super) fn backlog(&mut self) -> Option<PathTail> {
-        if self.unacknowledged.len() > BACKLOG {
-            self.tail()
-        } else {
-            None
-        }
+        self.path.backlog(self.hand.place.t)
     }
 
     /// Closes the path at the newest sample; returns how many knots that took.
     pub(super) fn close(&mut self) -> u32 {
-        let settled = self.settle(false);
-        let last = self.path.flush();
-        settled + u32::from(last.map(|knot| self.hold(knot)).is_some())
+        self.settle(false) + self.path.close(self.hand.place.t)
     }
 
-    /// The oldest unacknowledged knots for the stream but for the engagement, `None` if there are none. What is
-    /// handed over is forgotten: the stream delivers it as long as the engagement can live at all.
+    /// What is left for the stream: [`Path::tail`].
     pub(super) fn tail(&mut self) -> Option<PathTail> {
-        // Only an origin is wanted, and one that can travel wherever the hand is.
-        let state = WireState::quantise(&HandState::first(self.hand.place.t, Vector3::zeros()))?;
-        let count = self.unacknowledged.len().min(MAX_TAIL_KNOTS);
-        let knots = self.packed(&state, 0, count).filter(|k| !k.is_empty())?;
-        let first_knot = self.first_unacknowledged;
-        self.acknowledge(first_knot + count as u32);
-        Some(PathTail {
-            engagement: 0,
-            state,
-            first_knot,
-            knots,
-        })
+        self.path.tail(self.hand.place.t)
     }
 
     /// Whether the robot's prediction for `arrival` would differ by more than the bound.
@@ -356,7 +272,7 @@ impl Mirror {
             params,
             pose,
         } = travelling;
-        let (first_knot, knots) = self.due_knots(&state, (now, delay_s), copies);
+        let (first_knot, knots) = self.path.due(&state, (now, delay_s), copies);
         Some(Motion {
             epoch: 0,
             engagement: 0,
@@ -371,41 +287,6 @@ impl Mirror {
             first_knot,
             knots,
         })
-    }
-
-    /// The knots for a message sent now, without a gap, and the number of the first.
-    fn due_knots(
-        &mut self,
-        state: &WireState,
-        (now, delay_s): (Stamp, f64),
-        copies: u8,
-    ) -> (u32, KnotBlock) {
-        let overdue = |u: &Unacknowledged| now.secs_since(u.sent) > 2.0 * delay_s + PATIENCE_S;
-        let start = self
-            .unacknowledged
-            .iter()
-            .position(|u| u.copies < copies || overdue(u));
-        let start = start.unwrap_or(self.unacknowledged.len());
-        let end = self.unacknowledged.len().min(start + KNOTS_PER_MESSAGE);
-        let packed = self.packed(state, start, end);
-        if packed.is_some() {
-            for sent in self.unacknowledged.range_mut(start..end) {
-                sent.copies = sent.copies.saturating_add(1);
-                sent.sent = now;
-            }
-        }
-        (
-            self.first_unacknowledged + start as u32,
-            packed.unwrap_or_default(),
-        )
-    }
-
-    /// The unacknowledged knots `from..to` as they travel.
-    fn packed(&self, state: &WireState, from: usize, to: usize) -> Option<KnotBlock> {
-        let unacknowledged = self.unacknowledged.range(..to).map(|u| u.knot);
-        let known: Vec<_> = self.held.iter().copied().chain(unacknowledged).collect();
-        let (before, due) = known.split_at(self.held.len() + from);
-        KnotBlock::pack(state, self.code, before, due)
     }
 
     fn model(&self, skill: Option<&Skill>) -> u16 {

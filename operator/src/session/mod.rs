@@ -12,6 +12,7 @@ mod hand;
 mod hear;
 mod mirror;
 mod pace;
+mod path;
 mod said;
 #[cfg(test)]
 mod tests;
@@ -23,6 +24,7 @@ use std::sync::Arc;
 use telemime_endpoint::reception::Reception;
 use telemime_endpoint::tally::Tally;
 use telemime_protocol::checkpoint::PosePlan;
+use telemime_protocol::checkpoint::path::PathBounds;
 use telemime_protocol::predict::Params;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
@@ -38,6 +40,7 @@ use crate::recognise::{Recogniser, Verdict};
 
 pub use config::{FutureBound, HandSample, SessionConfig, default_scale};
 pub use correct::{Bent, Change, LOST_S, Leeway};
+pub use path::ShownKnot;
 pub use said::{Counters, Event, Output, Seen};
 
 use correct::Correction;
@@ -238,6 +241,15 @@ impl Session {
         self.config.path_bound_m.unwrap_or(derived).max(1e-4)
     }
 
+    /// What the robot's record of the path is promised to be, of a hand with an orientation or without.
+    fn path_bounds(&self, turns: bool) -> PathBounds {
+        let turn_rad = self.config.path_turn_bound_rad;
+        PathBounds::new(
+            self.path_bound_m(),
+            (turns && turn_rad > 0.0).then_some(turn_rad),
+        )
+    }
+
     /// The hand, live: mirrored, or, where a skill is played that may be corrected, a hand that holds on to it until
     /// [`Session::let_go`]. Samples out of order or not finite are dropped and counted.
     pub fn handle_sample(&mut self, now: Stamp, mut sample: HandSample) {
@@ -365,7 +377,8 @@ impl Session {
             return;
         };
         let skill = self.skill.as_deref().filter(|_| self.model_stored);
-        let path = (self.path_bound_m(), self.interval.us());
+        let bounds = self.path_bounds(hand.turn.is_some());
+        let path = (bounds, self.interval.us());
         let Ok(mirror) = Mirror::new(hand, path, self.config.gain, skill) else {
             self.events.push_back(Event::Refused(Refusal::BadMapping));
             return;
@@ -617,6 +630,8 @@ impl Session {
         self.engagement += 1;
         self.before = Some(self.counters);
         let rotation = self.config.rotation.as_ref();
+        let turns = matches!(&drive, Drive::Mirror { pose, .. } if pose.turn.is_some());
+        let bounds = self.path_bounds(turns);
         let engage = Engage {
             engagement: self.engagement,
             t_us: now.0 / 1000,
@@ -628,7 +643,8 @@ impl Session {
                 rotation.j as f32,
                 rotation.k as f32,
             ],
-            path_bound_um: (self.path_bound_m() * 1e6).round() as u32,
+            path_bound_um: bounds.place_um(),
+            path_turn_bound_urad: bounds.turn_urad(),
             sample_us: self.interval.us(),
             lease_ms: (self.config.lease_s * 1e3) as u16,
         };

@@ -1,6 +1,6 @@
 use std::sync::Arc;
 
-use nalgebra::Vector3;
+use nalgebra::{UnitQuaternion, Vector3};
 use telemime_protocol::checkpoint::select;
 use telemime_protocol::skill::example;
 use telemime_protocol::wire::v1::{ModelId, Motion};
@@ -17,6 +17,7 @@ mod commands;
 mod correcting;
 mod gating;
 mod mirroring;
+mod path;
 mod posing;
 mod resting;
 
@@ -87,8 +88,15 @@ impl Bench {
         for _ in 0..30 {
             bench.sample(home());
         }
-        bench.session.engage(bench.now);
-        bench.hears(&RobotControl::Engaged {
+        bench.grant();
+        bench.forget();
+        bench
+    }
+
+    /// Asks for engagement 1, which is granted.
+    fn grant(&mut self) {
+        self.session.engage(self.now);
+        self.hears(&RobotControl::Engaged {
             engagement: 1,
             t_us: 0,
             hand_m: [0.0; 3],
@@ -96,13 +104,11 @@ impl Bench {
             hand_q: None,
             tip_q: WireRotation::default(),
         });
-        bench.hears(&RobotControl::State {
+        self.hears(&RobotControl::State {
             state: RobotState::Engaged,
             cause: Cause::Requested,
             changes: 1,
         });
-        bench.forget();
-        bench
     }
 
     fn drain(&mut self) {
@@ -153,10 +159,19 @@ impl Bench {
 
     /// Lets 33 ms pass with everything that falls due, then takes a sample.
     fn sample(&mut self, x: Vector3<f64>) {
+        self.turned(x, None);
+    }
+
+    /// The same of a hand that has an orientation; the sample.
+    fn turned(&mut self, x: Vector3<f64>, orientation: Option<UnitQuaternion<f64>>) -> HandSample {
         self.idle(33);
-        let sample = HandSample::at(self.now, x);
+        let sample = HandSample {
+            orientation,
+            ..HandSample::at(self.now, x)
+        };
         self.session.handle_sample(self.now, sample);
         self.drain();
+        sample
     }
 
     /// Lets time pass, and does what falls due when it does.

@@ -2,12 +2,11 @@
 
 use std::collections::VecDeque;
 
-use nalgebra::Vector3;
 use telemime_protocol::predict::Forecast;
 use telemime_protocol::wire::arm::WireArm;
 
 use super::gate::Gate;
-use super::{Activity, HandSample, Session};
+use super::{Activity, HandSample, Session, ShownKnot};
 use crate::recognise::Recogniser;
 
 /// Samples kept for a listener that is slow: it looks many times a second.
@@ -27,8 +26,8 @@ impl Session {
         }
     }
 
-    /// The newest path knots, in the hand's axes, m, and whether the robot holds them.
-    pub fn recent_knots(&self) -> impl Iterator<Item = (Vector3<f64>, bool)> {
+    /// The newest path knots.
+    pub fn recent_knots(&self) -> impl Iterator<Item = ShownKnot> {
         let mirror = match &self.activity {
             Activity::Mirror(mirror) => Some(mirror),
             Activity::Nothing | Activity::Play { .. } => None,

@@ -4,7 +4,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid};
+use telemime_protocol::checkpoint::path::{PathBounds, PathDecoder};
 use telemime_protocol::predict::{Forecast, checksum};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::Version;
@@ -35,11 +35,16 @@ fn foretell(state: &WireState, params: &WireParams, pose: &WirePose) {
     checksum(&place, turn.as_ref());
 }
 
+/// As a path of places, and as one of poses.
 fn follow(state: &WireState, sent: &KnotBlock, limit: usize) {
-    let code = PathCode {
-        grid: PathGrid::for_bound(0.02).expect("a usable bound"),
-        sample_us: 33_333,
-    };
+    for turn_rad in [None, Some(0.05)] {
+        let bounds = PathBounds::new(0.02, turn_rad);
+        let code = PathCode::new(bounds, 33_333).expect("a usable bound");
+        follow_as(code, state, sent, limit);
+    }
+}
+
+fn follow_as(code: PathCode, state: &WireState, sent: &KnotBlock, limit: usize) {
     let Ok(knots) = sent.unpack(state, code, &[], limit) else {
         return;
     };
@@ -50,7 +55,7 @@ fn follow(state: &WireState, sent: &KnotBlock, limit: usize) {
         again.unpack(state, code, &[], limit).as_deref(),
         Ok(&knots[..])
     );
-    let mut path = PathDecoder::new(code.grid, limit);
+    let mut path = PathDecoder::new(code.grid(), limit);
     for knot in &knots {
         let _ = path.append(knot);
     }

@@ -4,7 +4,7 @@
 //! of the cheapest rules and orders, as here.
 
 use super::CheckpointError;
-use super::bits::{BitReader, BitWriter, best_order, zigzag};
+use super::bits::{BitReader, BitWriter, MAX_ORDER, best_order, golomb_bits, zigzag};
 use super::plan::{Grid, MAX_POINTS, MAX_STEPS};
 
 /// What a coordinate is expected to be, of the points before it.
@@ -22,10 +22,15 @@ enum Rule {
 
 const RULES: [Rule; 4] = [Rule::Hold, Rule::Line, Rule::HalfLine, Rule::Return];
 
-/// Orders of the codes in the head: number of points, mantissas, first coordinates.
+/// Orders of the codes in the head: number of points, mantissas, rates; the order of the gaps, and of the first column.
 const COUNT_ORDER: u32 = 5;
 const MANTISSA_ORDER: u32 = 4;
-const FIRST_ORDER: u32 = 10;
+const RATE_ORDER: u32 = 5;
+const GAP_ORDER: u32 = 1;
+const COLUMN_ORDER: u32 = 2;
+
+/// Up to this rate, Hz, no two have the same tick.
+const MAX_RATE_HZ: u32 = 1000;
 
 type Point<const D: usize> = (u32, [i32; D]);
 
@@ -64,58 +69,122 @@ fn mantissa(mut n: u32) -> (u32, u32) {
     (n, tens)
 }
 
+/// How a coordinate is written.
+struct Column {
+    rule: Rule,
+    order: u32,
+    /// How far each point but the first is off what the rule expects, zigzag.
+    off: Vec<u64>,
+}
+
+/// For each coordinate the first of the cheapest rules, and its lowest order.
+fn columns<const D: usize>(points: &[Point<D>]) -> [Column; D] {
+    core::array::from_fn(|d| {
+        let tried = RULES.map(|rule| {
+            let off: Vec<u64> = (1..points.len())
+                .map(|i| {
+                    let (p, expected) = (&points[i], expected(rule, &points[..i], points[i].0, d));
+                    zigzag(i64::from(p.1[d]) - expected)
+                })
+                .collect();
+            let (order, bits) = best_order(&off);
+            (bits, Column { rule, order, off })
+        });
+        let cheapest = tried.into_iter().min_by_key(|(bits, _)| *bits);
+        cheapest.expect("there are rules").1
+    })
+}
+
+/// The tick of so many a second, µs.
+fn tick_at(rate_hz: u32) -> u32 {
+    (1_000_000 + rate_hz / 2) / rate_hz
+}
+
+/// The rate that a tick is written as, if there is one and that takes no more bits than its digits.
+fn rate_of(tick_us: u32) -> Option<u32> {
+    let rate_hz = (1_000_000 + tick_us / 2).checked_div(tick_us)?;
+    let is_one = (1..=MAX_RATE_HZ).contains(&rate_hz) && tick_at(rate_hz) == tick_us;
+    let (digits, _) = mantissa(tick_us);
+    let short = golomb_bits(u64::from(rate_hz), RATE_ORDER)
+        <= golomb_bits(u64::from(digits), MANTISSA_ORDER) + 4;
+    (is_one && short).then_some(rate_hz)
+}
+
+/// The order of the first point's coordinates: that of a metre in steps.
+fn first_order(step_nm: u32) -> u32 {
+    (1_000_000_000 / step_nm.max(1)).max(1).ilog2()
+}
+
 pub(super) fn pack<const D: usize>(grid: Grid, points: &[Point<D>]) -> Vec<u8> {
     let mut w = BitWriter::default();
     w.golomb(points.len() as u64, COUNT_ORDER);
-    for n in [grid.step_nm(), grid.tick_us()] {
+    let number = |w: &mut BitWriter, n| {
         let (digits, tens) = mantissa(n);
         w.golomb(u64::from(digits), MANTISSA_ORDER);
         w.put(u64::from(tens), 4);
+    };
+    number(&mut w, grid.step_nm());
+    let rate = rate_of(grid.tick_us());
+    w.put(u64::from(rate.is_some()), 1);
+    match rate {
+        Some(rate_hz) => w.golomb(u64::from(rate_hz), RATE_ORDER),
+        None => number(&mut w, grid.tick_us()),
     }
-    let Some((first, rest)) = points.split_first() else {
+    let Some(first) = points.first() else {
         return w.finish();
     };
     w.golomb(u64::from(first.0), 0);
     for x in first.1 {
-        w.signed(i64::from(x), FIRST_ORDER);
+        w.signed(i64::from(x), first_order(grid.step_nm()));
     }
     let gaps: Vec<u64> = points
         .windows(2)
         .map(|p| u64::from(p[1].0 - p[0].0 - 1))
         .collect();
     let (gap_order, _) = best_order(&gaps);
-    w.put(u64::from(gap_order), 5);
-    let off = |rule: Rule, d: usize| -> Vec<u64> {
-        rest.iter()
-            .enumerate()
-            .map(|(i, p)| {
-                let expected = expected(rule, &points[..=i], p.0, d);
-                zigzag(i64::from(p.1[d]) - expected)
-            })
-            .collect()
-    };
-    let columns: [_; D] = core::array::from_fn(|d| {
-        let tried = RULES.iter().enumerate().map(|(index, rule)| {
-            let off = off(*rule, d);
-            let (order, bits) = best_order(&off);
-            (bits, index, order, off)
-        });
-        // The first of the cheapest.
-        tried
-            .min_by_key(|(bits, ..)| *bits)
-            .unwrap_or((0, 0, 0, Vec::new()))
-    });
-    for (_, rule, order, _) in &columns {
-        w.put(*rule as u64, 2);
-        w.put(u64::from(*order), 5);
+    w.golomb(u64::from(gap_order), GAP_ORDER);
+    let columns = columns(points);
+    let mut before = None;
+    for column in &columns {
+        w.put(column.rule as u64, 2);
+        match before.replace(column.order) {
+            None => w.golomb(u64::from(column.order), COLUMN_ORDER),
+            Some(before) => w.signed(i64::from(column.order) - i64::from(before), 0),
+        }
     }
     for (i, gap) in gaps.iter().enumerate() {
         w.golomb(*gap, gap_order);
-        for (_, _, order, off) in &columns {
-            w.golomb(off[i], *order);
+        for column in &columns {
+            w.golomb(column.off[i], column.order);
         }
     }
     w.finish()
+}
+
+/// What values cost with the rules and orders that are best for some points, and a little more for what is far off:
+/// what leads to fewer bits in the end.
+pub(super) struct Price<const D: usize> {
+    columns: [(Rule, u32); D],
+}
+
+impl<const D: usize> Price<D> {
+    pub(super) fn of(points: &[Point<D>]) -> Self {
+        Self {
+            columns: columns(points).map(|c| (c.rule, c.order)),
+        }
+    }
+
+    /// Bits of the coordinate `d` of those points whose code depends on the points `j` and `j + 1`.
+    pub(super) fn around(&self, points: &[Point<D>], j: usize, d: usize) -> f64 {
+        let (rule, order) = self.columns[d];
+        let bits = |i: usize| {
+            let p = &points[i];
+            let off = zigzag(i64::from(p.1[d]) - expected(rule, &points[..i], p.0, d));
+            let unit = (1_u64 << order) as f64;
+            golomb_bits(off, order) as f64 + 0.3 * libm::log2(1.0 + 2.0 * off as f64 / unit)
+        };
+        (j.max(1)..points.len().min(j + 4)).map(bits).sum()
+    }
 }
 
 /// What [`pack`] packed.
@@ -134,15 +203,26 @@ pub(super) fn unpack<const D: usize>(
             least: 2,
         });
     }
-    let mut number = || {
+    let number = |r: &mut BitReader<'_>| {
         let digits = r.golomb(MANTISSA_ORDER)?;
         let tens = r.take(4)? as u32;
         // Too large for any grid is not a grid.
         Some(u32::try_from(digits.saturating_mul(10u64.pow(tens))).unwrap_or(0))
     };
-    let step_nm = number().ok_or(truncated.clone())?;
-    let tick_us = number().ok_or(truncated.clone())?;
-    let grid = Grid::new(step_nm, tick_us)?;
+    let step_nm = number(&mut r).ok_or(truncated.clone())?;
+    let tick_us = match r.take(1).ok_or(truncated.clone())? {
+        0 => number(&mut r),
+        _ => r.golomb(RATE_ORDER).map(|rate_hz| {
+            let rate_hz = u32::try_from(rate_hz).unwrap_or(0);
+            // No rate is not a grid either.
+            if (1..=MAX_RATE_HZ).contains(&rate_hz) {
+                tick_at(rate_hz)
+            } else {
+                0
+            }
+        }),
+    };
+    let grid = Grid::new(step_nm, tick_us.ok_or(truncated.clone())?)?;
     let mut points: Vec<Point<D>> = Vec::with_capacity(count as usize);
     let in_range = |n: i64, index| {
         i32::try_from(n)
@@ -154,14 +234,25 @@ pub(super) fn unpack<const D: usize>(
     let first = u32::try_from(first).map_err(|_| CheckpointError::OutOfRange { index: 0 })?;
     let mut x = [0; D];
     for x in &mut x {
-        *x = in_range(r.signed(FIRST_ORDER).ok_or(truncated.clone())?, 0)?;
+        *x = in_range(r.signed(first_order(step_nm)).ok_or(truncated.clone())?, 0)?;
     }
     points.push((first, x));
-    let gap_order = r.take(5).ok_or(truncated.clone())? as u32;
+    let order = |n: Option<i64>| {
+        n.and_then(|n| u32::try_from(n).ok())
+            .filter(|n| *n <= MAX_ORDER)
+            .ok_or(CheckpointError::Truncated)
+    };
+    let gap_order = order(r.golomb(GAP_ORDER).map(|n| n as i64))?;
     let mut columns = [(Rule::Hold, 0); D];
+    let mut before = None;
     for column in &mut columns {
         let rule = r.take(2).ok_or(truncated.clone())? as usize;
-        *column = (RULES[rule], r.take(5).ok_or(truncated.clone())? as u32);
+        let this = order(match before {
+            None => r.golomb(COLUMN_ORDER).map(|n| n as i64),
+            Some(before) => r.signed(0).map(|n| i64::from(before) + n),
+        })?;
+        before = Some(this);
+        *column = (RULES[rule], this);
     }
     for index in 1..count as usize {
         let gap = r.golomb(gap_order).ok_or(truncated.clone())?;

@@ -186,6 +186,19 @@ impl<const D: usize> Plan<D> {
         self.points.len()
     }
 
+    /// The points, in ticks and steps.
+    pub(super) fn points(&self) -> &[(u32, [i32; D])] {
+        &self.points
+    }
+
+    /// Other points on the same grid.
+    pub(super) fn with_points(
+        &self,
+        points: Vec<(u32, [i32; D])>,
+    ) -> Result<Self, CheckpointError> {
+        Self::checked(self.grid, points)
+    }
+
     /// The grid its points lie on.
     pub fn grid(&self) -> Grid {
         self.grid
@@ -260,9 +273,9 @@ mod tests {
         let plan = plan();
         let bytes = encode(&plan);
         let golden = [
-            &[0x14, 0x8e, 0x2d, 0x13, 0xcc, 0x88, 0x01, 0x95, 0xd0, 0x1c][..],
+            &[0x14, 0x8e, 0x2c, 0x89, 0xec, 0x88, 0x01, 0x15, 0xca, 0x16][..],
             &[
-                0x38, 0x0f, 0xcf, 0x27, 0x27, 0x2b, 0xc9, 0x9e, 0x00, 0x7d, 0x10,
+                0x41, 0xdf, 0x9e, 0x4e, 0x4e, 0x57, 0x93, 0x3c, 0x00, 0xfa, 0x20,
             ],
         ]
         .concat();

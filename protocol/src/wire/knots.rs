@@ -4,7 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use super::codec::DecodeError;
 use super::state::WireState;
-use crate::checkpoint::path::{self, BlockError, Origin, PathGrid, PathKnot, tick_of};
+use crate::checkpoint::CheckpointError;
+use crate::checkpoint::path::{
+    self, BlockError, Origin, POSE, PathBounds, PathGrid, PathKnot, PoseKnot, tick_of,
+};
 
 /// Knots of a path as bits: [`KnotBlock::pack`] and [`KnotBlock::unpack`]. Without knots it is empty.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -13,14 +16,38 @@ pub struct KnotBlock(pub Vec<u8>);
 /// What both ends know of a path before its first knot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PathCode {
-    /// The grid of the path's bound.
-    pub grid: PathGrid,
-    /// `Engage::sample_us`: the interval of the hand's samples, µs.
-    pub sample_us: u32,
+    grid: PathGrid<POSE>,
+    turns: bool,
+    sample_us: u32,
 }
 
-/// The tick and the position (in steps of `grid`) that the first knot of a path is relative to.
-fn origin(state: &WireState, grid: PathGrid) -> Origin {
+impl PathCode {
+    /// Of an `Engage`: its bounds, and the interval of the hand's samples, µs.
+    ///
+    /// # Errors
+    /// As [`PathBounds::grid`].
+    pub fn new(bounds: PathBounds, sample_us: u32) -> Result<Self, CheckpointError> {
+        Ok(Self {
+            grid: bounds.grid()?,
+            turns: bounds.turn_rad().is_some(),
+            sample_us,
+        })
+    }
+
+    /// The grid the knots lie on.
+    pub fn grid(&self) -> PathGrid<POSE> {
+        self.grid
+    }
+
+    /// Whether the path carries the orientation.
+    pub fn turns(&self) -> bool {
+        self.turns
+    }
+}
+
+/// The tick and the position (in steps of `grid`) that the first knot of a path is relative to; its orientation is
+/// relative to nothing.
+fn origin(state: &WireState, grid: PathGrid<POSE>) -> Origin {
     let state = state.dequantise();
     let steps = state.x / grid.step_m();
     // `as` saturates; both ends compute it from the same integers.
@@ -35,6 +62,23 @@ fn origin(state: &WireState, grid: PathGrid) -> Origin {
     }
 }
 
+fn turned(origin: Origin) -> Origin<POSE> {
+    let [x, y, z] = origin.x;
+    Origin {
+        tick: origin.tick,
+        x: [x, y, z, 0, 0, 0, 0],
+    }
+}
+
+/// The knots that count of those before a block.
+fn recent(before: &[PoseKnot]) -> &[PoseKnot] {
+    &before[before.len().saturating_sub(path::CONTEXT)..]
+}
+
+fn places(knots: &[PoseKnot]) -> Vec<PathKnot> {
+    knots.iter().map(PoseKnot::place).collect()
+}
+
 impl KnotBlock {
     /// `knots` (in order), given those `before` them on the path, of which the last
     /// [`CONTEXT`](path::CONTEXT) count; `state` is the message's, and counts if there are none.
@@ -43,11 +87,16 @@ impl KnotBlock {
     pub fn pack(
         state: &WireState,
         code: PathCode,
-        before: &[PathKnot],
-        knots: &[PathKnot],
+        before: &[PoseKnot],
+        knots: &[PoseKnot],
     ) -> Option<Self> {
-        let origin = origin(state, code.grid);
-        path::pack(code.sample_us, &origin, before, knots).map(Self)
+        let (origin, before) = (origin(state, code.grid), recent(before));
+        if code.turns {
+            path::pack(code.sample_us, &turned(origin), before, knots)
+        } else {
+            path::pack(code.sample_us, &origin, &places(before), &places(knots))
+        }
+        .map(Self)
     }
 
     /// What [`KnotBlock::pack`] packed, at most `limit` knots. They are in range; `PathDecoder::append` judges
@@ -59,11 +108,15 @@ impl KnotBlock {
         &self,
         state: &WireState,
         code: PathCode,
-        before: &[PathKnot],
+        before: &[PoseKnot],
         limit: usize,
-    ) -> Result<Vec<PathKnot>, BlockError> {
-        let origin = origin(state, code.grid);
-        path::unpack(code.sample_us, &origin, before, &self.0, limit)
+    ) -> Result<Vec<PoseKnot>, BlockError> {
+        let (origin, before) = (origin(state, code.grid), recent(before));
+        if code.turns {
+            return path::unpack(code.sample_us, &turned(origin), before, &self.0, limit);
+        }
+        let knots = path::unpack(code.sample_us, &origin, &places(before), &self.0, limit)?;
+        Ok(knots.into_iter().map(PoseKnot::from).collect())
     }
 
     /// How many knots it claims to hold, at most `limit`.
@@ -97,10 +150,7 @@ mod tests {
     use nalgebra::Vector3;
 
     fn code() -> PathCode {
-        PathCode {
-            grid: PathGrid::for_bound(0.02).unwrap(),
-            sample_us: 33_333,
-        }
+        PathCode::new(PathBounds::new(0.02, None), 33_333).unwrap()
     }
 
     fn state(ns: i64) -> WireState {
@@ -113,12 +163,12 @@ mod tests {
         for ns in 0..20_000 {
             let t = Stamp(3_000_000_000 + ns);
             let state = state(t.0);
-            let knot = PathKnot {
+            let knot = PoseKnot::from(PathKnot {
                 tick: tick_of(t),
                 x: [35, -20, 250],
                 v: [0; 3],
                 start: true,
-            };
+            });
             let packed = KnotBlock::pack(&state, code(), &[], &[knot]).expect("not later");
             let found = packed.unpack(&state, code(), &[], 1).unwrap();
             assert_eq!(found, [knot], "{ns} ns");
@@ -128,11 +178,13 @@ mod tests {
     #[test]
     fn knots_come_back_and_one_later_than_its_origin_is_refused() {
         let state = state(3_000_000_000);
-        let knot = |ms: i64, x, v, start| PathKnot {
-            tick: ms * 100,
-            x,
-            v,
-            start,
+        let knot = |ms: i64, x, v, start| {
+            PoseKnot::from(PathKnot {
+                tick: ms * 100,
+                x,
+                v,
+                start,
+            })
         };
         let knots = [
             knot(2_400, [35, -20, 250], [2, -400, 0], true),
@@ -151,5 +203,38 @@ mod tests {
         let late = [knot(3_001, [0; 3], [0; 3], true)];
         assert_eq!(KnotBlock::pack(&state, code(), &[], &late), None);
         assert!(KnotBlock::pack(&state, code(), &knots, &late).is_some());
+    }
+
+    #[test]
+    fn an_orientation_takes_bits_only_where_it_was_asked_for() {
+        let state = state(3_000_000_000);
+        let turning = PathCode::new(PathBounds::new(0.02, Some(0.05)), 33_333).unwrap();
+        let knot = |ms: i64, x, v, start| PoseKnot {
+            tick: ms * 100,
+            x,
+            v,
+            start,
+        };
+        let knots = [
+            knot(
+                2_400,
+                [35, -20, 250, 78, 12, 3, 0],
+                [2, -400, 0, 8, 0, 0, 2],
+                true,
+            ),
+            knot(
+                2_700,
+                [40, -20, 251, 79, 12, -4, 0],
+                [4, -400, 0, 2, 0, 6, 0],
+                false,
+            ),
+        ];
+        let places: Vec<_> = knots.iter().map(|k| k.place().into()).collect();
+        let plain = KnotBlock::pack(&state, code(), &[], &knots).unwrap();
+        assert_eq!(plain.unpack(&state, code(), &[], 2).unwrap(), places);
+        assert_eq!(Some(plain), KnotBlock::pack(&state, code(), &[], &places));
+        let whole = KnotBlock::pack(&state, turning, &[], &knots).unwrap();
+        assert_eq!(whole.unpack(&state, turning, &[], 2).unwrap(), knots);
+        assert!(whole.unpack(&state, code(), &[], 2).is_err());
     }
 }

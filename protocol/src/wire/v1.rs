@@ -13,6 +13,7 @@ use super::knots::KnotBlock;
 pub use super::params::WireParams;
 use super::state::WireState;
 use super::turn::{WirePose, WireRotation};
+use crate::checkpoint::path::{MAX_TURN_URAD, PathBounds};
 
 mod reports;
 pub use reports::{Reception, RobotDatagram, ServoTimes, Telemetry};
@@ -105,12 +106,21 @@ pub struct Engage {
     pub scale: f32,
     /// Unit quaternion w, x, y, z that turns hand axes into the robot's base axes.
     pub rotation: [f32; 4],
-    /// Bound of the path knots, µm: their quantisation steps follow from it.
+    /// Bound of the path, µm: its knots' quantisation steps follow from it.
     pub path_bound_um: u32,
+    /// The same of the hand's orientation, µrad, at most [`MAX_TURN_URAD`]; 0: the path carries none.
+    pub path_turn_bound_urad: u32,
     /// Interval of the hand's samples, µs, in 1 ..= 10⁶: the knots' times are counted in it. A guess is enough.
     pub sample_us: u32,
     /// First lease, ms.
     pub lease_ms: u16,
+}
+
+impl Engage {
+    /// How exact the path is.
+    pub fn path_bounds(&self) -> PathBounds {
+        PathBounds::of_wire(self.path_bound_um, self.path_turn_bound_urad)
+    }
 }
 
 /// What drives the arm.
@@ -437,6 +447,11 @@ impl OperatorControl {
                     "not a unit quaternion",
                 )?;
                 require(engage.path_bound_um > 0, "engage.path_bound_um", "zero")?;
+                require(
+                    engage.path_turn_bound_urad <= MAX_TURN_URAD,
+                    "engage.path_turn_bound_urad",
+                    "above half a turn",
+                )?;
                 require(
                     (1..=MAX_SAMPLE_US).contains(&engage.sample_us),
                     "engage.sample_us",

@@ -2,7 +2,7 @@
 
 use nalgebra::{SVector, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
-use telemime_protocol::checkpoint::path::PathDecoder;
+use telemime_protocol::checkpoint::path::{PathDecoder, pose as on_path};
 use telemime_protocol::checkpoint::{Checkpoint, Grid, Plan, PosePlan};
 use telemime_protocol::pose;
 use telemime_protocol::predict::{Forecast, TurnForecast, TurnState, checksum};
@@ -18,7 +18,7 @@ use telemime_protocol::wire::v1::*;
 
 use super::Vector;
 use super::draw::Draw;
-use super::messages::{BOUND_UM, code, path_knots};
+use super::messages::{BOUND_UM, SAMPLE_US, code, path_knots};
 
 fn v3(v: &Vector3<f64>) -> Value {
     json!([v.x, v.y, v.z])
@@ -219,13 +219,13 @@ fn pairing(all: &mut Vec<Vector>) {
 
 fn paths(all: &mut Vec<Vector>) {
     let draw = &mut Draw::new(4);
-    let code = code();
-    for (i, (before, n)) in [(0, 1), (0, 2), (1, 1), (3, 5), (8, 32), (20, 100)]
-        .into_iter()
-        .enumerate()
-    {
+    let places = [(0, 1), (0, 2), (1, 1), (3, 5), (8, 32), (20, 100)].map(|n| (0, n));
+    let poses = [(0, 1), (2, 3), (9, 20)].map(|n| (50_000, n));
+    for (i, (turn_urad, (before, n))) in places.into_iter().chain(poses).enumerate() {
+        let code = code(turn_urad);
         let state = moving(i as u32).state;
-        let all_knots = path_knots(draw, &state, before + n);
+        let all_knots = path_knots(draw, &state, before + n, code);
+        let carried = if code.turns() { 7 } else { 3 };
         let (held, sent) = all_knots.split_at(before);
         let tail = PathTail {
             engagement: 1,
@@ -235,22 +235,27 @@ fn paths(all: &mut Vec<Vector>) {
         };
         let unpacked = tail.knots.unpack(&state, code, held, MAX_TAIL_KNOTS);
         assert_eq!(unpacked.as_deref(), Ok(sent));
-        let mut path = PathDecoder::new(code.grid, before + n);
+        let mut path = PathDecoder::new(code.grid(), before + n);
         let told: Vec<_> = all_knots
             .iter()
             .map(|k| {
                 path.append(k).expect("a path in order");
-                json!([k.tick, k.x, k.v, k.start])
+                json!([k.tick, k.x[..carried], k.v[..carried], k.start])
             })
             .collect();
         let mut at = Vec::new();
         for w in all_knots.windows(2).filter(|w| !w[1].start) {
             let t = Stamp((w[0].tick * 3 + w[1].tick) * 10_000 / 4);
             let jet = path.eval(t).expect("between joined knots");
-            at.push(json!({"t_ns": t.0, "x": v3(&jet.x), "v": v3(&jet.v)}));
+            at.push(json!({
+                "t_ns": t.0,
+                "x": v3(&on_path::place(&jet.x)),
+                "v": v3(&on_path::place(&jet.v)),
+                "q": on_path::turn(&jet.x).map(|q| q4(&q)),
+            }));
         }
         let value = json!({
-            "path_bound_um": BOUND_UM, "sample_us": code.sample_us, "before": before, "knots": told, "at": at,
+            "path_bound_um": BOUND_UM, "path_turn_bound_urad": turn_urad, "sample_us": SAMPLE_US, "before": before, "knots": told, "at": at,
         });
         all.push(says("path", i, OperatorControl::Path(tail).encode(), value));
     }

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 use serde_json::json;
-use telemime_protocol::checkpoint::path::{PathGrid, PathKnot, tick_of};
+use telemime_protocol::checkpoint::path::{POSE, PathBounds, PathGrid, PoseKnot, tick_of};
 use telemime_protocol::wire::arm::{WireArm, WireCapsule, WireJoint, WireJointKind, WirePlace};
 use telemime_protocol::wire::hello::{Answer, Hello, RejectCode};
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
@@ -160,38 +160,45 @@ const REASONS: [Refusal; 11] = [
 
 pub(crate) const BOUND_UM: u32 = 20_000;
 
-/// What a path is coded with.
-pub(crate) fn code() -> PathCode {
-    PathCode {
-        grid: PathGrid::for_bound(f64::from(BOUND_UM) * 1e-6).expect("a usable bound"),
-        sample_us: 33_333,
-    }
+pub(crate) const SAMPLE_US: u32 = 33_333;
+
+/// What a path is coded with; a bound of 0 µrad carries no orientation.
+pub(crate) fn code(turn_urad: u32) -> PathCode {
+    let bounds = PathBounds::of_wire(BOUND_UM, turn_urad);
+    PathCode::new(bounds, SAMPLE_US).expect("a usable bound")
 }
 
 /// A path of `n` knots that ends shortly before the state.
-pub(crate) fn path_knots(draw: &mut Draw, state: &WireState, n: usize) -> Vec<PathKnot> {
+pub(crate) fn path_knots(
+    draw: &mut Draw,
+    state: &WireState,
+    n: usize,
+    code: PathCode,
+) -> Vec<PoseKnot> {
     let s = state.dequantise();
     let mut tick = tick_of(s.t) - 30_000 * n as i64;
-    let mut x: [i32; 3] = (s.x / code().grid.step_m())
-        .map(|v| v.round() as i32)
-        .into();
+    let place = (s.x / code.grid().step_m()).map(|v| v.round() as i32);
+    let mut x = [place.x, place.y, place.z, 40, -30, 9, 0];
+    let carried = if code.turns() { POSE } else { 3 };
+    x[carried..].fill(0);
     (0..n)
         .map(|i| {
             let span = 1 + draw.bits(14) as i64;
             tick += span;
-            x = x.map(|v| v + draw.signed(6) as i32);
+            x[..carried]
+                .iter_mut()
+                .for_each(|v| *v += draw.signed(6) as i32);
             let start = i == 0 || draw.below(8) == 0;
             let shift = if start {
                 1
             } else {
                 PathGrid::<3>::slope_shift(span)
             };
-            PathKnot {
-                tick,
-                x,
-                v: std::array::from_fn(|_| (draw.signed(5) as i32) << shift),
-                start,
-            }
+            let mut v = [0; POSE];
+            v[..carried]
+                .iter_mut()
+                .for_each(|v| *v = (draw.signed(5) as i32) << shift);
+            PoseKnot { tick, x, v, start }
         })
         .collect()
 }
@@ -204,6 +211,7 @@ fn engage(draw: &mut Draw, drive: Drive) -> OperatorControl {
         scale: [0.125, 1.0, 10.0][draw.below(3)],
         rotation: [[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.5, -0.5]][draw.below(2)],
         path_bound_um: 1 + draw.bits(31) as u32,
+        path_turn_bound_urad: draw.maybe(|draw| draw.bits(21) as u32).unwrap_or(0),
         sample_us: 1 + draw.bits(19) as u32,
         lease_ms: draw.u16(),
     })
@@ -211,7 +219,7 @@ fn engage(draw: &mut Draw, drive: Drive) -> OperatorControl {
 
 fn motion(draw: &mut Draw, knot_count: usize) -> Motion {
     let state = draw.state();
-    let path = path_knots(draw, &state, knot_count);
+    let path = path_knots(draw, &state, knot_count, code(0));
     Motion {
         epoch: draw.u32(),
         engagement: draw.u32(),
@@ -223,7 +231,7 @@ fn motion(draw: &mut Draw, knot_count: usize) -> Motion {
         state,
         pose: draw.pose(),
         first_knot: draw.u32(),
-        knots: KnotBlock::pack(&state, code(), &[], &path).expect("a path before the state"),
+        knots: KnotBlock::pack(&state, code(0), &[], &path).expect("a path before the state"),
     }
 }
 

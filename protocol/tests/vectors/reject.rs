@@ -1,7 +1,9 @@
 //! Bytes that are no message, each with the name of the reason (docs/protocol.md §2, §3).
 
+mod finished;
+
 use telemime_protocol::checkpoint::PosePlan;
-use telemime_protocol::skill::{Skill, SkillError, example};
+use telemime_protocol::skill::{Skill, SkillError};
 use telemime_protocol::wire::arm::{WireArm, WireCapsule, WireJoint, WireJointKind, WirePlace};
 use telemime_protocol::wire::bend::{WireBend, WireHeld};
 use telemime_protocol::wire::frame::{Deframer, MAX_FRAME_LEN};
@@ -158,14 +160,16 @@ fn control(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
             scale: 0.125,
             rotation: [0.5, -0.5, 0.5, -0.5],
             path_bound_um: 200,
+            path_turn_bound_urad: 200,
             sample_us: 200,
             lease_ms: 200,
         })
     };
     let play = engage(Drive::Play { plan: 1 }).encode();
-    // From the end: lease 1, samples 1, bound 1, rotation 16, scale 4.
+    // From the end: lease 1, samples 1, both bounds 1, rotation 16, scale 4.
     let from_end = |n| play.len() - n;
-    let (samples, bound, rotation, scale) = (from_end(2), from_end(3), from_end(19), from_end(23));
+    let (samples, turned, bound) = (from_end(2), from_end(3), from_end(4));
+    let (rotation, scale) = (from_end(20), from_end(24));
     let scaled = |v: f32| {
         let mut bytes = play.clone();
         bytes[scale..scale + 4].copy_from_slice(&v.to_le_bytes());
@@ -214,6 +218,17 @@ fn control(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
         OPERATOR_CONTROL,
         "engage, not a rotation",
         with(play.clone(), rotation + 3, 0x40),
+        "Invalid",
+    );
+    say(
+        OPERATOR_CONTROL,
+        "engage, an orientation's path bound above half a turn",
+        [
+            &play[..turned],
+            &codec::encode(&3_141_593_u32),
+            &play[turned + 1..],
+        ]
+        .concat(),
         "Invalid",
     );
     say(
@@ -540,72 +555,6 @@ fn datagrams(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
     );
 }
 
-fn plans_and_skills(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
-    let plan = [
-        0x14, 0x8e, 0x2d, 0x13, 0xcc, 0x88, 0x01, 0x95, 0xd0, 0x1c, 0x38, 0x0f, 0xcf, 0x27, 0x27,
-        0x2b, 0xc9, 0x9e, 0x00, 0x7d, 0x10, 0, 0,
-    ];
-    say(
-        "plan",
-        "cut short",
-        plan[..plan.len() - 1].to_vec(),
-        "Malformed",
-    );
-    say(
-        "plan",
-        "and more",
-        [plan.as_slice(), &[0]].concat(),
-        "Trailing",
-    );
-    say(
-        "plan",
-        "bits too soon at an end",
-        with(plan[..].to_vec(), 0, 0x13)[..22].to_vec(),
-        "Malformed",
-    );
-    say(
-        "plan",
-        "nothing but zeros",
-        [vec![20], vec![0; 22]].concat(),
-        "Malformed",
-    );
-    say(
-        "plan",
-        "the same points from dearer codes",
-        [
-            &[0x14][..],
-            &[
-                0x8e, 0x2d, 0x13, 0xcc, 0x88, 0x01, 0x95, 0xd0, 0x93, 0x18, 0x0f, 0xc9, 0xd0, 0x6c,
-                0xe5, 0x5c, 0x38, 0x00, 0x7d, 0x10,
-            ],
-            &[0, 0],
-        ]
-        .concat(),
-        "NotCanonical",
-    );
-    let skill = example(1, 1).to_bytes().to_vec();
-    say(
-        "skill",
-        "cut short",
-        skill[..skill.len() - 1].to_vec(),
-        "Malformed",
-    );
-    say(
-        "skill",
-        "and more",
-        [skill.as_slice(), &[0]].concat(),
-        "Trailing",
-    );
-    // "wave" stands in bytes 1 to 4, the duration after it.
-    let mut still = skill.clone();
-    still[5..13].copy_from_slice(&0.0_f64.to_le_bytes());
-    say("skill", "of no duration", still, "Invalid");
-    let mut nameless = skill.clone();
-    nameless.drain(1..5);
-    nameless[0] = 0;
-    say("skill", "without a name", nameless, "Invalid");
-}
-
 pub(crate) fn rejects() -> Vec<Vector> {
     let mut all = Vec::new();
     let mut say = |kind: &'static str, name: &str, bytes: Vec<u8>, expected: &'static str| {
@@ -620,6 +569,6 @@ pub(crate) fn rejects() -> Vec<Vector> {
     greetings(&mut say);
     control(&mut say);
     datagrams(&mut say);
-    plans_and_skills(&mut say);
+    finished::plans_and_skills(&mut say);
     all
 }

@@ -245,6 +245,7 @@ impl Bench {
             scale: 0.5,
             rotation: [1.0, 0.0, 0.0, 0.0],
             path_bound_um: 20_000,
+            path_turn_bound_urad: 50_000 * u32::from(engagement % 2 == 0),
             sample_us: 33_333,
             lease_ms: 650,
         });

@@ -11,6 +11,7 @@ use telemime_endpoint::reception::{Quantiles, Received};
 use telemime_endpoint::recording::{self, Outcome};
 
 use crate::blackbox::News;
+use crate::daemon::PathPoint;
 use crate::desk::Progress;
 use crate::servo::thread::Times;
 use crate::servo::{ArmFault, Locked, Realtime, Report};
@@ -89,7 +90,7 @@ pub enum Event {
         tip_q: [f64; 4],
     },
     Path {
-        knots: Vec<(f64, [f64; 3], [f64; 3], bool)>,
+        knots: Vec<PathPoint>,
     },
     Driver {
         command: String,

@@ -552,8 +552,7 @@ impl Session {
                 params,
                 pose,
             } => {
-                let mirror = Mirror::new(engage.path_bound_um, engage.sample_us)
-                    .ok_or(Refusal::BadMapping)?;
+                let mirror = Mirror::new(engage).ok_or(Refusal::BadMapping)?;
                 let state = state.dequantise();
                 let valid_at = self.clock.to_mono(state.t).ok_or(Refusal::ClockUnknown)?;
                 let age_s = now.secs_since(valid_at);

@@ -1,14 +1,14 @@
 //! What a motion message does: the future goes to the servo, the path into the record.
 
 use telemime_endpoint::Mono;
-use telemime_protocol::checkpoint::path::{PathDecoder, PathGrid};
+use telemime_protocol::checkpoint::path::{POSE, PathDecoder};
 use telemime_protocol::predict::{Forecast, HandState, Params, TurnForecast, checksum};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::bend::WireBend;
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
 use telemime_protocol::wire::turn::{WireTurn, dequantise_grip};
-use telemime_protocol::wire::v1::{MAX_TAIL_KNOTS, Motion, PathTail, Refusal, model_tag};
+use telemime_protocol::wire::v1::{Engage, MAX_TAIL_KNOTS, Motion, PathTail, Refusal, model_tag};
 
 use super::Session;
 use crate::servo::{Bent, Lease, Order};
@@ -23,7 +23,7 @@ struct Impossible;
 #[derive(Debug)]
 pub struct Mirror {
     code: PathCode,
-    path: PathDecoder,
+    path: PathDecoder<POSE>,
     frontier: u32,
     newest_t: Stamp,
     diverged: bool,
@@ -195,14 +195,12 @@ impl Session {
 }
 
 impl Mirror {
-    /// An empty path on the grid of `bound_um`, of samples at intervals of `sample_us`; `None` if there is no such
-    /// grid.
-    pub(super) fn new(bound_um: u32, sample_us: u32) -> Option<Self> {
-        let grid = PathGrid::for_bound(f64::from(bound_um) * 1e-6).ok()?;
-        let path = PathDecoder::new(grid, PATH_KNOTS);
+    /// An empty path on the grid of the engagement's bounds; `None` if there is no such grid.
+    pub(super) fn new(engage: &Engage) -> Option<Self> {
+        let code = PathCode::new(engage.path_bounds(), engage.sample_us).ok()?;
         Some(Self {
-            code: PathCode { grid, sample_us },
-            path,
+            code,
+            path: PathDecoder::new(code.grid(), PATH_KNOTS),
             frontier: 0,
             newest_t: Stamp(i64::MIN),
             diverged: false,
@@ -214,9 +212,14 @@ impl Mirror {
         self.frontier
     }
 
-    /// The path received.
-    pub fn path(&self) -> &PathDecoder {
+    /// The path received: places, and orientations if [`Mirror::turns`].
+    pub fn path(&self) -> &PathDecoder<POSE> {
         &self.path
+    }
+
+    /// Whether the path carries the hand's orientation.
+    pub fn turns(&self) -> bool {
+        self.code.turns()
     }
 
     fn take_knots(&mut self, state: &WireState, first_knot: u32, block: &KnotBlock) {

@@ -2,7 +2,7 @@ use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
-use telemime_protocol::checkpoint::path::{PathEncoder, PathGrid, PathKnot, TICK_NS};
+use telemime_protocol::checkpoint::path::{PathBounds, PathEncoder, PoseKnot, TICK_NS};
 use telemime_protocol::checkpoint::select;
 use telemime_protocol::predict::{HandState, Params};
 use telemime_protocol::skill::{Skill, example};
@@ -239,6 +239,7 @@ impl Bench {
             scale: 0.1,
             rotation: [1.0, 0.0, 0.0, 0.0],
             path_bound_um: 20_000,
+            path_turn_bound_urad: 0,
             sample_us: 33_333,
             lease_ms: 650,
         }

@@ -40,6 +40,7 @@ def _engage(m):
     require(0 < m["scale"] <= 10, "scale", m["scale"])
     require(abs(sum(c * c for c in m["rotation"]) - 1) <= 1e-3, "rotation", m["rotation"])
     require(m["path_bound_um"] > 0, "path_bound_um", 0)
+    require(m["path_turn_bound_urad"] <= 3_141_592, "path_turn_bound_urad", m["path_turn_bound_urad"])
     require(1 <= m["sample_us"] <= 1_000_000, "sample_us", m["sample_us"])
 
 
@@ -113,7 +114,7 @@ OPERATOR_CONTROL = Enum(
     ("Plan", Struct(("id", U32), ("bytes", Bytes(131_072)))),
     ("Engage", Struct(
         ("engagement", U32), ("t_us", I64), ("drive", DRIVE), ("scale", F32), ("rotation", Array(F32, 4)),
-        ("path_bound_um", U32), ("sample_us", U32), ("lease_ms", U16), check=_engage)),
+        ("path_bound_um", U32), ("path_turn_bound_urad", U32), ("sample_us", U32), ("lease_ms", U16), check=_engage)),
     ("Path", Struct(("engagement", U32), ("state", STATE), ("first_knot", U32), ("knots", Knots(1024)))),
     ("Release", Struct(("engagement", U32))),
     "EmergencyStop",

@@ -11,13 +11,16 @@ MEMORY = 8
 
 
 class Grid:
-    """Steps that follow from an engagement's path bound, and the interval of its samples (µs)."""
+    """Steps that follow from an engagement's path bounds, and the interval of its samples (µs)."""
 
-    def __init__(self, path_bound_um, sample_us):
+    def __init__(self, path_bound_um, sample_us, path_turn_bound_urad=0):
         n = math.floor(path_bound_um * 1e-6 / 2e-9 * (1 + 1e-9))
         require(1 <= n < 2**32, "path bound", path_bound_um)
         self.step = n * 1e-9
-        self.speed_step = 8 * self.step
+        self.steps = [self.step] * 3
+        if path_turn_bound_urad:
+            self.steps += [250 * path_turn_bound_urad * 1e-9] * 4
+        self.dims = len(self.steps)
         self.sample_us = sample_us
 
     def samples(self, dt):
@@ -66,17 +69,22 @@ class _Code:
     """What both directions share: columns, and what is expected of a joined knot."""
 
     def __init__(self, grid, before):
-        self.grid, self.columns = grid, [Column(8, 2), Column(0, 2), Column(72, 6), Column(36, 6)]
+        self.grid, self.columns = grid, [Column(8, 2), Column(0, 2)]
+        # Position and tangent; those of an orientation.
+        self.columns += [Column(72, 6), Column(36, 6), Column(72, 6), Column(36, 6)]
         before = before[-MEMORY:]
         for a, b in zip(before, before[1:]):
             if not b.start:
                 self.learn(*self.difference(a, b))
 
     def orders(self):
-        return [c.order() for c in self.columns]
+        """Of samples and jitter; of each position, and of each tangent."""
+        a, b, c, d, e, f = (c.order() for c in self.columns)
+        return a, b, [c] * 3 + [e] * 4, [d] * 3 + [f] * 4
 
     def learn(self, n, late, dx, dv):
-        for column, numbers in zip(self.columns, ([n], [zigzag(late)], map(zigzag, dx), map(zigzag, dv))):
+        dx, dv = [zigzag(n) for n in dx], [zigzag(n) for n in dv]
+        for column, numbers in zip(self.columns, ([n], [zigzag(late)], dx[:3], dv[:3], dx[3:], dv[3:])):
             for number in numbers:
                 column.learn(number)
 
@@ -98,7 +106,7 @@ class _Code:
 
 
 def _origin(state, grid):
-    return (state["t_us"] + 5) // 10, [round_away(1e-4 * n / grid.step) for n in state["x"]]
+    return (state["t_us"] + 5) // 10, [round_away(1e-4 * n / grid.step) for n in state["x"]] + [0] * (grid.dims - 3)
 
 
 def count(data):
@@ -119,15 +127,15 @@ def decode(state, data, grid, before=()):
             gap = r.golomb(12)
             at, last = (known[-1].x, known[-1].tick + gap + 1) if known else (origin, tick - gap)
             x = [e + r.signed(6) for e in at]
-            knot = Knot(last, x, [2 * r.signed(4) for _ in range(3)], True)
+            knot = Knot(last, x, [2 * r.signed(4) for _ in at], True)
         else:
             last = known[-1]
             late = r.signed(b)
             dt = grid.ticks(n - 1) + late
             require(1 <= dt < 1 << 31 and grid.samples(dt) == n - 1, "dt", dt)
-            dx = [r.signed(c) for _ in range(3)]
+            dx = [r.signed(k) for _, k in zip(last.x, c)]
             x = [e + o for e, o in zip(code.place(last, dt), dx)]
-            dv = [r.signed(d) for _ in range(3)]
+            dv = [r.signed(k) for _, k in zip(last.x, d)]
             v = [(e + o) << shift(dt) for e, o in zip(code.tangent(last, x, dt), dv)]
             knot = Knot(last.tick + dt, x, v, False)
             code.learn(n, late, dx, dv)
@@ -159,10 +167,10 @@ def encode(state, knots, grid, before=()):
             n, late, dx, dv = code.difference(known[-1], knot)
             w.golomb(n, a)
             w.signed(late, b)
-            for n_x in dx:
-                w.signed(n_x, c)
-            for n_v in dv:
-                w.signed(n_v, d)
+            for n_x, k in zip(dx, c):
+                w.signed(n_x, k)
+            for n_v, k in zip(dv, d):
+                w.signed(n_v, k)
             code.learn(n, late, dx, dv)
         known.append(knot)
     return w.bytes()
@@ -172,8 +180,8 @@ def quantise(grid, t, x, v, before=None):
     """The knot nearest to a place and a velocity at session time t (s); joined to `before`, if there is one."""
     tick = round(t / TICK)
     unit = 1 << (shift(tick - before.tick) if before else 1)
-    speed = [unit * round_away(c / grid.speed_step / unit) for c in v]
-    return Knot(tick, [round_away(c / grid.step) for c in x], speed, before is None)
+    speed = [unit * round_away(c / (8 * step) / unit) for c, step in zip(v, grid.steps)]
+    return Knot(tick, [round_away(c / step) for c, step in zip(x, grid.steps)], speed, before is None)
 
 
 def evaluate(before, after, grid, t_ns):
@@ -181,11 +189,18 @@ def evaluate(before, after, grid, t_ns):
     ticks = after.tick - before.tick
     h, u = ticks * TICK, (t_ns - before.tick * TICK_NS) / (ticks * TICK_NS)
     x, v = [], []
-    for x0, x1, v0, v1 in zip(before.x, after.x, before.v, after.v):
-        x0, x1, v0, v1 = x0 * grid.step, x1 * grid.step, v0 * grid.speed_step, v1 * grid.speed_step
+    for x0, x1, v0, v1, step in zip(before.x, after.x, before.v, after.v, grid.steps):
+        x0, x1, v0, v1 = x0 * step, x1 * step, v0 * 8 * step, v1 * 8 * step
         c = (x1 - x0) / h
         b, a = 3 * c - 2 * v0 - v1, v0 + v1 - 2 * c
         x.append(x0 + h * (v0 * u + b * u * u + a * u**3))
         v.append(v0 + 2 * b * u + 3 * a * u * u)
     return x, v
 
+
+
+def orientation(x):
+    """The rotation in a point of a path that carries it; of q and −q the one with w ≥ 0."""
+    q = x[3:]
+    n = math.copysign(math.hypot(*q), q[0])
+    return [c / n for c in q]

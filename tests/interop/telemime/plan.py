@@ -36,16 +36,48 @@ def _power(n):
     return n, power
 
 
+def _write_number(w, n):
+    digits, power = _power(n)
+    w.golomb(digits, 4)
+    w.bits(power, 4)
+
+
+def _tick(rate):
+    return (1_000_000 + rate // 2) // rate
+
+
+def _rate(tick):
+    """The rate a tick is written as, or None."""
+    rate = (1_000_000 + tick // 2) // tick
+    is_one = 1 <= rate <= 1000 and _tick(rate) == tick
+    return rate if is_one and cost(rate, 5) <= cost(_power(tick)[0], 4) + 4 else None
+
+
+def _first(step):
+    """The order of the first point's coordinates: that of a metre in steps."""
+    return max(1, 1_000_000_000 // step).bit_length() - 1
+
+
 def unpack(data, dims):
     """{step_nm, tick_us, points: [(tick, values)]} of a plan's bits."""
     r = BitReader(data)
     count = r.golomb(5)
     require(2 <= count <= MOST, "points", count)
     step = r.golomb(4) * 10 ** r.bits(4)
-    tick = r.golomb(4) * 10 ** r.bits(4)
-    points = [(r.golomb(0), [r.signed(10) for _ in range(dims)])]
-    gaps = r.bits(5)
-    rules = [(r.bits(2), r.bits(5)) for _ in range(dims)]
+    if r.bits(1):
+        rate = r.golomb(5)
+        require(1 <= rate <= 1000, "rate", rate)
+        tick = _tick(rate)
+    else:
+        tick = r.golomb(4) * 10 ** r.bits(4)
+    require(step >= 1, "step_nm", step)
+    points = [(r.golomb(0), [r.signed(_first(step)) for _ in range(dims)])]
+    gaps = r.golomb(1)
+    rules = []
+    for _ in range(dims):
+        rule = r.bits(2)
+        rules.append((rule, rules[-1][1] + r.signed(0) if rules else r.golomb(2)))
+    require(0 <= gaps <= 31 and all(0 <= k <= 31 for _, k in rules), "orders", (gaps, rules))
     for _ in range(count - 1):
         last, older = points[-1], points[-2] if len(points) > 1 else None
         t = last[0] + 1 + r.golomb(gaps)
@@ -89,17 +121,23 @@ def pack(plan):
         columns.append((rule, k, rests[rule]))
     w = BitWriter()
     w.golomb(len(points), 5)
-    for n in (plan["step_nm"], plan["tick_us"]):
-        digits, power = _power(n)
-        w.golomb(digits, 4)
-        w.bits(power, 4)
+    _write_number(w, plan["step_nm"])
+    rate = _rate(plan["tick_us"])
+    w.bits(1 if rate else 0, 1)
+    if rate:
+        w.golomb(rate, 5)
+    else:
+        _write_number(w, plan["tick_us"])
     w.golomb(points[0][0], 0)
     for n in points[0][1]:
-        w.signed(n, 10)
-    w.bits(order, 5)
-    for rule, k, _ in columns:
+        w.signed(n, _first(plan["step_nm"]))
+    w.golomb(order, 1)
+    for i, (rule, k, _) in enumerate(columns):
         w.bits(rule, 2)
-        w.bits(k, 5)
+        if i:
+            w.signed(k - columns[i - 1][1], 0)
+        else:
+            w.golomb(k, 2)
     for i, n in enumerate(gap):
         w.golomb(n, order)
         for _, k, rest in columns:

@@ -50,7 +50,7 @@ impl Live {
         let knots = following.and(session).map_or_else(Vec::new, |session| {
             let knots = session.recent_knots();
             knots
-                .map(|(x, held)| point(&x, f64::from(u8::from(held))))
+                .map(|knot| point(&knot.x, f64::from(u8::from(knot.held))))
                 .collect()
         });
         Snapshot {

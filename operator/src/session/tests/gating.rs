@@ -1,7 +1,7 @@
 //! Glitches, the input's latency, what was driven, and a skill that changes.
 
 use super::*;
-use nalgebra::UnitQuaternion;
+use telemime_protocol::checkpoint::path::pose;
 
 /// Where the newest motion says the hand is.
 fn said(bench: &Bench) -> Vector3<f64> {
@@ -74,10 +74,10 @@ fn the_path_waits_for_the_truth() {
         }
         bench.session.release();
         bench.drain();
-        let path = super::mirroring::by_stream(&bench.control, 1e-3);
+        let path = super::path::by_stream(&bench.control, 1e-3);
         for (i, (t, x)) in seen.iter().enumerate() {
             let glitch = running == 2 && i < 2;
-            let off_m = (path.eval(*t).unwrap().x - x).norm();
+            let off_m = (pose::place(&path.eval(*t).unwrap().x) - x).norm();
             if glitch {
                 assert!(off_m > 0.4, "a glitch is no part of the path: {off_m}");
             } else {

@@ -1,7 +1,6 @@
 //! Orientation and gripper, as the operator sends them.
 
 use super::*;
-use nalgebra::UnitQuaternion;
 use telemime_protocol::pose;
 use telemime_protocol::predict::{TurnForecast, checksum};
 use telemime_protocol::skill::posed_example;

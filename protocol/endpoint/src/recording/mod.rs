@@ -24,7 +24,7 @@ use telemime_protocol::time::Stamp;
 use live::Live;
 pub use own::{Hand, Json, OperatorState, Own, RobotState};
 use queue::{Queue, Taken};
-pub use shapes::{BASE, Drawn, Look, in_base, info, points, warning};
+pub use shapes::{BASE, Drawn, Look, in_base, info, points, poses, warning};
 pub use tape::{At, Tape};
 
 /// What is written is on the disk's side of the process after this long, s: more is not lost when it is killed.

@@ -208,10 +208,18 @@ pub fn in_base(t: Stamp, at: &V3<f64>, turn: &UnitQuaternion<f64>) -> PoseInFram
 
 /// Points in [`BASE`], m, in order.
 pub fn points(t: Stamp, at: impl Iterator<Item = V3<f64>>) -> foxglove::messages::PosesInFrame {
+    poses(t, at.map(|m| (m, UnitQuaternion::identity())))
+}
+
+/// Poses in [`BASE`], m, in order.
+pub fn poses(
+    t: Stamp,
+    at: impl Iterator<Item = (V3<f64>, UnitQuaternion<f64>)>,
+) -> foxglove::messages::PosesInFrame {
     foxglove::messages::PosesInFrame {
         timestamp: Some(timestamp(t)),
         frame_id: BASE.to_owned(),
-        poses: at.map(|m| pose(&m, &UnitQuaternion::identity())).collect(),
+        poses: at.map(|(m, turn)| pose(&m, &turn)).collect(),
     }
 }
 

@@ -50,7 +50,8 @@ impl<const D: usize> PathEncoder<D> {
         Ok(Self::on(grid, second, bounds))
     }
 
-    fn on(grid: PathGrid<D>, second: usize, bounds: [f64; 2]) -> Self {
+    /// On a grid that is fine enough for these bounds.
+    pub(super) fn on(grid: PathGrid<D>, second: usize, bounds: [f64; 2]) -> Self {
         Self {
             grid,
             reach: Reach::new(Bounds::new(second, bounds), MAX_OPEN),

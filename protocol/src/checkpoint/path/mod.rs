@@ -8,11 +8,13 @@
 mod decoder;
 mod encoder;
 mod packed;
+pub mod pose;
 mod reach;
 
 pub use decoder::PathDecoder;
 pub use encoder::PathEncoder;
 pub use packed::{BlockError, CONTEXT, Origin, count, pack, unpack};
+pub use pose::{MAX_TURN_URAD, POSE, PathBounds, PoseKnot};
 
 use nalgebra::SVector;
 

@@ -94,14 +94,25 @@ impl Column {
     }
 }
 
-/// The four columns, and the interval of the samples, µs.
+/// Coordinates from this one on, an orientation's, have columns of their own.
+const SECOND: usize = 3;
+
+/// The columns, and the interval of the samples, µs.
 #[derive(Clone, Copy)]
 struct Model {
     samples: Column,
     jitter: Column,
-    positions: Column,
-    tangents: Column,
+    positions: [Column; 2],
+    tangents: [Column; 2],
     interval_us: i64,
+}
+
+fn group(d: usize) -> usize {
+    usize::from(d >= SECOND)
+}
+
+fn orders(columns: &[Column; 2]) -> [u32; 2] {
+    columns.map(Column::order)
 }
 
 /// A joined knot as the numbers that are written.
@@ -116,8 +127,8 @@ impl Model {
         let mut model = Self {
             samples: Column::new(SAMPLES),
             jitter: Column::new(JITTER),
-            positions: Column::new(POSITIONS),
-            tangents: Column::new(TANGENTS),
+            positions: [Column::new(POSITIONS); 2],
+            tangents: [Column::new(TANGENTS); 2],
             interval_us: i64::from(interval_us.max(1)),
         };
         let recent = &before[before.len().saturating_sub(CONTEXT)..];
@@ -133,8 +144,10 @@ impl Model {
     fn learn<const D: usize>(&mut self, numbers: &Numbers<D>) {
         self.samples.learn(numbers.time[0]);
         self.jitter.learn(numbers.time[1]);
-        numbers.x.iter().for_each(|n| self.positions.learn(*n));
-        numbers.v.iter().for_each(|n| self.tangents.learn(*n));
+        for (d, (x, v)) in numbers.x.iter().zip(&numbers.v).enumerate() {
+            self.positions[group(d)].learn(*x);
+            self.tangents[group(d)].learn(*v);
+        }
     }
 
     /// How many intervals are nearest to so many ticks (10 µs), halves upwards.
@@ -216,9 +229,13 @@ pub fn pack<const D: usize>(
                 let numbers = model.numbers(&a, knot)?;
                 w.golomb(numbers.time[0], model.samples.order());
                 w.golomb(numbers.time[1], model.jitter.order());
-                let (x, v) = (model.positions.order(), model.tangents.order());
-                numbers.x.iter().for_each(|n| w.golomb(*n, x));
-                numbers.v.iter().for_each(|n| w.golomb(*n, v));
+                let (x, v) = (orders(&model.positions), orders(&model.tangents));
+                for (d, n) in numbers.x.iter().enumerate() {
+                    w.golomb(*n, x[group(d)]);
+                }
+                for (d, n) in numbers.v.iter().enumerate() {
+                    w.golomb(*n, v[group(d)]);
+                }
                 model.learn(&numbers);
             }
             _ if !knot.start => return None,
@@ -360,14 +377,14 @@ fn read<const D: usize>(
         v: [0; D],
     };
     let (mut x, mut v) = ([0; D], [0; D]);
-    let order = model.positions.order();
+    let order = orders(&model.positions);
     for (d, expected) in expected_x(a, ticks).into_iter().enumerate() {
-        numbers.x[d] = r.golomb(order).ok_or(truncated.clone())?;
+        numbers.x[d] = r.golomb(order[group(d)]).ok_or(truncated.clone())?;
         x[d] = in_range(expected + unzigzag(numbers.x[d]))?;
     }
-    let (order, shift) = (model.tangents.order(), PathGrid::<D>::slope_shift(ticks));
+    let (order, shift) = (orders(&model.tangents), PathGrid::<D>::slope_shift(ticks));
     for (d, expected) in expected_v(a, &x, ticks).into_iter().enumerate() {
-        numbers.v[d] = r.golomb(order).ok_or(truncated.clone())?;
+        numbers.v[d] = r.golomb(order[group(d)]).ok_or(truncated.clone())?;
         v[d] = in_range((expected + unzigzag(numbers.v[d])) << shift)?;
     }
     model.learn(&numbers);

@@ -1,6 +1,7 @@
 //! Which moments of a finished motion to keep.
 
 mod bounded;
+mod cheapen;
 mod counted;
 mod fit;
 mod publication;

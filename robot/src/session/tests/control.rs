@@ -210,6 +210,10 @@ fn impossible_requests_end_the_session() {
         },
         Engage {
             path_bound_um: 0,
+            ..good.clone()
+        },
+        Engage {
+            path_turn_bound_urad: 3_141_593,
             ..good
         },
     ] {

@@ -3,7 +3,7 @@
 use super::*;
 
 /// Two seconds of a moving hand, as the operator sends it: the knots in order, with the time of their making.
-fn knots(bench: &Bench) -> Vec<PathKnot> {
+fn knots(bench: &Bench) -> Vec<PoseKnot> {
     let mut encoder = PathEncoder::new(0.02).unwrap();
     let mut knots = Vec::new();
     for i in 0..60 {
@@ -14,20 +14,17 @@ fn knots(bench: &Bench) -> Vec<PathKnot> {
     }
     knots.extend(encoder.flush());
     assert!(knots.len() > 8, "{}", knots.len());
-    knots
+    knots.into_iter().map(PoseKnot::from).collect()
 }
 
 impl Bench {
     /// Sends `knots[range]`, with a state just after the last of them.
-    fn send_knots(&mut self, seq: u32, knots: &[PathKnot], range: std::ops::Range<usize>) {
+    fn send_knots(&mut self, seq: u32, knots: &[PoseKnot], range: std::ops::Range<usize>) {
         let last = knots[range.end - 1];
         let t = Stamp(last.tick * TICK_NS + MS);
         self.now = Mono(t.0 - OFFSET + 50 * MS);
         let state = WireState::quantise(&moving(t)).unwrap();
-        let code = PathCode {
-            grid: PathGrid::for_bound(0.02).unwrap(),
-            sample_us: 33_333,
-        };
+        let code = PathCode::new(PathBounds::new(0.02, None), 33_333).unwrap();
         let (before, due) = knots[..range.end].split_at(range.start);
         let motion = Motion {
             state,
@@ -59,7 +56,7 @@ fn repeated_knots_count_once_and_a_gap_waits() {
     assert_eq!(bench.frontier() as usize, knots.len());
     assert_eq!(bench.dropped(), 0);
 
-    let grid: PathGrid = PathGrid::for_bound(0.02).unwrap();
+    let grid = PathBounds::new(0.02, None).grid().unwrap();
     let held = bench.session.mirror().unwrap().path().knots();
     let sent = knots.iter().map(|k| grid.dequantise(k).unwrap());
     assert!(held.copied().eq(sent), "every knot, in order, to the bit");
@@ -88,7 +85,7 @@ fn knots_that_cannot_be_leave_the_path_as_it_was() {
     let mut far = knots.clone();
     // Further on than a span can be.
     far[2].tick = far[1].tick + 100_001;
-    far[2].v = [0; 3];
+    far[2].v = [0; 7];
     bench.send_knots(2, &far, 2..3);
     // Not the knots it says it holds.
     let noise = Motion {
