@@ -59,7 +59,7 @@ async function drive(person) {
   assert.ok(distance(moved, before) > 0.08, `it went somewhere: ${moved}`);
   assert.ok((await person.now("knots")).length > 1, "checkpoints arrive");
 
-  step("what is recognised is the skill that was taught, how far it has got, and then that the hand rests");
+  step("what is recognised is that the hand rests, and the skill that was taught");
   await person.until(() => document.getElementById("skill").textContent === "resting");
   await person.released();
   await person.until(() => document.getElementById("skill").textContent === "–");

@@ -56,8 +56,6 @@ impl Live {
         self.scale = session.scale().unwrap_or(1.0);
         self.offset = Vector3::zeros();
         self.taking.clear();
-        // Nothing is recognised yet of what this hand is going to do.
-        self.seen = None;
         self.hold = Some(Hold {
             page,
             what,

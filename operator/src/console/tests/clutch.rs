@@ -14,8 +14,7 @@ use telemime_protocol::wire::v1::{
 
 use super::super::live::{Known, LEASE_S};
 use super::super::{Act, Command, Holding, Live, Port, Said, seat};
-use crate::recognise::Verdict;
-use crate::session::{Event, Output, Session, SessionConfig};
+use crate::session::{Output, Session, SessionConfig};
 
 const MS: i64 = 1_000_000;
 
@@ -259,25 +258,6 @@ fn one_page_drives_and_anybody_stops() {
     assert_eq!(bench.releases(), 1);
     bench.hand(1, 0.6, 0.0);
     assert_eq!(bench.engages(), 1, "what was stopped stays stopped");
-}
-
-#[test]
-fn a_fresh_press_shows_nothing_of_what_the_last_was_recognised_as() {
-    let mut bench = driving();
-    let arc = Event::Recognised {
-        verdict: Verdict::Skill(0),
-        skill: Some("arc".into()),
-        probability: 0.9,
-        phase: 0.5,
-    };
-    bench.live.on_event(bench.now, &arc);
-    bench.wait(30);
-    let seen = |bench: &Bench| bench.port.snapshots.borrow().seen.clone();
-    assert_eq!(seen(&bench).and_then(|seen| seen.skill), Some("arc".into()));
-    bench.says(1, Command::Release {});
-    bench.holds(1, Holding::Hand);
-    bench.wait(30);
-    assert!(seen(&bench).is_none());
 }
 
 #[test]
