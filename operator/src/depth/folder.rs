@@ -163,8 +163,8 @@ pub fn decode(path: &Path, source: impl Read) -> Result<(Size, Vec<u16>), Folder
         path: path.to_owned(),
         why: why.to_string(),
     };
-    let mut reader = Decoder::new(source).read_info().map_err(png)?;
-    let (width, height) = reader.info().size();
+    let mut decoder = Decoder::new(source);
+    let (width, height) = decoder.read_header_info().map_err(png)?.size();
     if width.max(height) as usize > LARGEST {
         return Err(FolderError::Large {
             path: path.to_owned(),
@@ -172,6 +172,7 @@ pub fn decode(path: &Path, source: impl Read) -> Result<(Size, Vec<u16>), Folder
             height,
         });
     }
+    let mut reader = decoder.read_info().map_err(png)?;
     let found = reader.output_color_type();
     if found != (ColorType::Grayscale, BitDepth::Sixteen) {
         let (colour, bits) = found;
