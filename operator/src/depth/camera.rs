@@ -5,7 +5,7 @@ use std::str::FromStr;
 use nalgebra::Vector3;
 
 /// The largest frame, pixels a side.
-const LARGEST: usize = 4096;
+pub(super) const LARGEST: usize = 4096;
 
 /// The smallest in which a hand can be found.
 const SMALLEST: usize = 32;

@@ -1,12 +1,13 @@
 //! A recording of depth frames: a folder of 16-bit PNG files, one a frame, in the order of the numbers in their names.
 
 use std::fs::{self, File};
-use std::io::{self, BufReader};
+use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use png::{BitDepth, ColorType, Decoder};
 
 use super::Size;
+use super::camera::LARGEST;
 
 /// Why a folder is no recording, or a file no frame.
 #[derive(Debug, thiserror::Error)]
@@ -40,6 +41,16 @@ pub enum FolderError {
         path: PathBuf,
         /// What it has.
         found: String,
+    },
+    /// More pixels than any camera's, which nothing is allocated for.
+    #[error("{}: {width} × {height} pixels: a side has {LARGEST} at most", path.display())]
+    Large {
+        /// The file.
+        path: PathBuf,
+        /// Columns.
+        width: u32,
+        /// Rows.
+        height: u32,
     },
     /// Frames of different sizes.
     #[error(
@@ -136,17 +147,32 @@ fn number(file: &Path) -> (Option<u64>, String) {
 }
 
 fn read(path: &Path) -> Result<(Size, Vec<u16>), FolderError> {
-    let png = |why: png::DecodingError| FolderError::Png {
-        path: path.to_owned(),
-        why: why.to_string(),
-    };
     let file = File::open(path).map_err(|source| FolderError::Io {
         path: path.to_owned(),
         source,
     })?;
-    let mut reader = Decoder::new(BufReader::new(file))
-        .read_info()
-        .map_err(png)?;
+    decode(path, BufReader::new(file))
+}
+
+/// A frame's size and its pixels, row by row from the top, from the PNG in `source`, which is called `path`.
+///
+/// # Errors
+/// [`FolderError`], naming `path`.
+pub fn decode(path: &Path, source: impl Read) -> Result<(Size, Vec<u16>), FolderError> {
+    let png = |why: png::DecodingError| FolderError::Png {
+        path: path.to_owned(),
+        why: why.to_string(),
+    };
+    let mut decoder = Decoder::new(source);
+    let (width, height) = decoder.read_header_info().map_err(png)?.size();
+    if width.max(height) as usize > LARGEST {
+        return Err(FolderError::Large {
+            path: path.to_owned(),
+            width,
+            height,
+        });
+    }
+    let mut reader = decoder.read_info().map_err(png)?;
     let found = reader.output_color_type();
     if found != (ColorType::Grayscale, BitDepth::Sixteen) {
         let (colour, bits) = found;
@@ -214,6 +240,17 @@ mod tests {
         let error = open().unwrap_err().to_string();
         assert!(
             error.contains("1.png") && error.contains("16 bits"),
+            "{error}"
+        );
+        // A header alone, of a picture that would take 32 GB.
+        let mut huge = Vec::new();
+        let mut encoder = png::Encoder::new(&mut huge, 1 << 17, 1 << 17);
+        encoder.set_depth(BitDepth::Sixteen);
+        drop(encoder.write_header().unwrap());
+        fs::write(dir.path().join("0.png"), huge).unwrap();
+        let error = open().unwrap_err().to_string();
+        assert!(
+            error.contains("0.png") && error.contains("131072 × 131072"),
             "{error}"
         );
         fs::write(dir.path().join("0.png"), b"not a picture").unwrap();

@@ -9,4 +9,4 @@ mod folder;
 
 pub use camera::{Camera, CameraError, Intrinsics, Size};
 pub use find::{Finder, Found};
-pub use folder::{Folder, FolderError};
+pub use folder::{Folder, FolderError, decode};

@@ -224,14 +224,19 @@ impl PairMessage {
         };
         let mut rest = &bytes[MAGIC.len() + 1..];
         let message = match kind {
-            1 => match short(&mut rest) {
-                Some(text) => Self::Offer(read_name(text)?),
+            1 => match name(&mut rest)? {
+                Some(name) => Self::Offer(name),
                 None => return Ok(None),
             },
-            2 => match (fixed(&mut rest), short(&mut rest)) {
-                (Some(commitment), Some(text)) => Self::Commit(commitment, read_name(text)?),
-                _ => return Ok(None),
-            },
+            2 => {
+                let Some(commitment) = fixed(&mut rest) else {
+                    return Ok(None);
+                };
+                match name(&mut rest)? {
+                    Some(name) => Self::Commit(commitment, name),
+                    None => return Ok(None),
+                }
+            }
             3 | 4 => match fixed(&mut rest) {
                 Some(nonce) if kind == 3 => Self::Nonce(nonce),
                 Some(nonce) => Self::Reveal(nonce),
@@ -265,11 +270,19 @@ fn short<'a>(rest: &mut &'a [u8]) -> Option<&'a [u8]> {
     Some(text)
 }
 
-fn read_name(text: &[u8]) -> Result<Name, PairDecodeError> {
-    std::str::from_utf8(text)
-        .ok()
-        .and_then(Name::new)
-        .ok_or(PairDecodeError::Name)
+/// A name; one that is too long is refused by its length and not waited for.
+fn name(rest: &mut &[u8]) -> Result<Option<Name>, PairDecodeError> {
+    if rest
+        .first()
+        .is_some_and(|&len| usize::from(len) > MAX_NAME_LEN)
+    {
+        return Err(PairDecodeError::Name);
+    }
+    let Some(text) = short(rest) else {
+        return Ok(None);
+    };
+    let name = std::str::from_utf8(text).ok().and_then(Name::new);
+    name.map(Some).ok_or(PairDecodeError::Name)
 }
 
 /// What the robot commits to its nonce with.
@@ -376,6 +389,9 @@ mod tests {
                 head(1, &[[65].as_slice(), &[b'a'; 65]].concat()),
                 PairDecodeError::Name,
             ),
+            // Before it has arrived.
+            (head(1, &[65]), PairDecodeError::Name),
+            (head(2, &[255; 33]), PairDecodeError::Name),
             (head(7, &[1, 0, 1, 0xff]), PairDecodeError::Text),
         ] {
             assert_eq!(PairMessage::decode(&bytes), Err(error), "{bytes:?}");

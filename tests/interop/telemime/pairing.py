@@ -49,7 +49,11 @@ def parse(data):
             return None
         fields["code"] = int.from_bytes(data[at : at + 2], "little")
         at += 2
-    if len(data) < at + 1 or len(data) < at + 1 + data[at]:
+    if len(data) < at + 1:
+        return None
+    if kind in NAMED and data[at] > 64:
+        raise WireError("Name", f"a name of {data[at]} bytes")
+    if len(data) < at + 1 + data[at]:
         return None
     text, at = bytes(data[at + 1 : at + 1 + data[at]]), at + 1 + data[at]
     if kind == 7:

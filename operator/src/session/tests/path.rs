@@ -107,7 +107,7 @@ fn streamed(turns: bool, lost: impl Fn(usize) -> bool, acknowledge: bool) -> Str
         acknowledgements.push_back(frontier);
         let seen = acknowledgements.pop_front().unwrap_or_default();
         if acknowledge {
-            bench.receives(&RobotDatagram::Telemetry(telemetry(i as u32, seen)));
+            bench.receives(&RobotDatagram::Telemetry(telemetry(i, seen)));
         }
     }
     let made = bench.session.counters().knots;
