@@ -106,6 +106,11 @@ impl CheckConfigArgs {
     }
 }
 
+/// `1 run`, `2 runs`.
+pub(crate) fn plural(n: usize, one: &str, many: &str) -> String {
+    format!("{n} {}", if n == 1 { one } else { many })
+}
+
 /// The whole command line, for man pages and completions.
 pub(crate) fn command() -> clap::Command {
     Cli::command()
@@ -226,6 +231,7 @@ pub fn main() -> ExitCode {
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
+        Err(e) if e.is::<demo::CutShort>() => ExitCode::FAILURE,
         Err(e) => {
             eprintln!("telemime: {}", one_line(e.chain()));
             match e.downcast_ref::<experiment::Missing>() {

@@ -10,6 +10,7 @@ use nalgebra::Vector3;
 use serde::Serialize;
 use telemime_endpoint::HostClock;
 use telemime_operator::demonstration::Demonstration;
+use telemime_operator::input::{Kind, Units, frame};
 use telemime_operator::tap::latency;
 
 /// After the last press the hand's stop is still waited for, s.
@@ -19,8 +20,8 @@ const AFTER_S: f64 = 1.0;
 ///
 /// Tap about ten times, fast and not in an even rhythm, and rest the hand for a moment after each. Either from a
 /// recording and a file with the moments of the taps, on the recording's clock; or live: the tracker's samples
-/// come on stdin as they are made (lines t,x,y,z; their own time is not used), and you press Enter on the terminal
-/// with the other hand whenever the first one touches. The result is what `telemime operator --input-latency` wants.
+/// come on stdin as they are made (the lines that `telemime operator --input -` takes, or t,x,y,z; their own time is
+/// not used), and you press Enter on the terminal with the other hand whenever the first one touches. The result is what `telemime operator --input-latency` wants.
 #[derive(clap::Args, Debug, Clone)]
 pub(crate) struct Args {
     /// The recording (CSV: t,x,y,z), or - for live samples on stdin.
@@ -149,8 +150,13 @@ fn live(count: usize) -> anyhow::Result<(Samples, Vec<f64>)> {
             .lines()
             .map_while(std::result::Result::ok)
         {
-            let what = position(&line).map_or(Heard::Other(line), Heard::Sample);
-            if samples.send((clock.now(), what)).is_err() {
+            let at = clock.now();
+            let what = match sample(&line) {
+                Some(Some(x)) => Heard::Sample(x),
+                Some(None) => continue,
+                None => Heard::Other(line),
+            };
+            if samples.send((at, what)).is_err() {
                 return;
             }
         }
@@ -176,7 +182,9 @@ fn live(count: usize) -> anyhow::Result<(Samples, Vec<f64>)> {
             Heard::Sample(_) => {}
             // A header.
             Heard::Other(_) if samples.is_empty() => {}
-            Heard::Other(line) => bail!("stdin: `{line}` is no sample t,x,y,z"),
+            Heard::Other(line) => bail!(
+                "stdin: `{line}` is no sample: neither t,x,y,z nor a line of JSON with x, y and z"
+            ),
             Heard::Press => {
                 taps.push(t_s);
                 eprintln!("{} of {count}", taps.len());
@@ -189,6 +197,17 @@ fn live(count: usize) -> anyhow::Result<(Samples, Vec<f64>)> {
         }
     }
     Ok((samples, taps))
+}
+
+/// The hand in a line as `telemime operator --input -` takes it, or `t,x,y,z[,…]`: `Some(None)` where there is none in it, `None` if it is neither.
+fn sample(line: &str) -> Option<Option<Vector3<f64>>> {
+    if !line.trim_start().starts_with('{') {
+        return position(line).map(Some);
+    }
+    match frame::parse(line.as_bytes(), &Units::default()) {
+        Ok(frame) => Some(frame.hand.map(|hand| hand.position)),
+        Err(fault) => (fault.kind != Kind::Malformed).then_some(None),
+    }
 }
 
 /// The position of a line `t,x,y,z[,…]`.
@@ -215,6 +234,21 @@ mod tests {
         );
         for line in ["t,x,y,z", "", "1,2,3", "1,2,3,nan", "1,2,3,x"] {
             assert_eq!(position(line), None, "{line}");
+        }
+    }
+
+    #[test]
+    fn what_an_operator_would_take_is_taken() {
+        let at = |line| sample(line).flatten();
+        assert_eq!(at("1,0.1,0.2,2"), Some(Vector3::new(0.1, 0.2, 2.0)));
+        let point = r#"{"t":1,"x":0.1,"y":0.2,"z":2}"#;
+        assert_eq!(at(point), Some(Vector3::new(0.1, 0.2, 2.0)));
+        // No hand for a moment, and a pedal.
+        for line in [r#"{"joints":{"head":[0,0,2]}}"#, r#"{"engage":true}"#] {
+            assert_eq!(sample(line), Some(None), "{line}");
+        }
+        for line in ["{", r#"{"x":1}"#, "t,x,y,z"] {
+            assert_eq!(sample(line), None, "{line}");
         }
     }
 }

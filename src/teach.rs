@@ -10,6 +10,7 @@ use telemime_operator::placed::{Motion, Placed};
 use telemime_operator::skill_file;
 use telemime_protocol::skill::Skill;
 
+use crate::cli::plural;
 use crate::figure;
 use crate::picture::{self, Subject};
 
@@ -246,14 +247,10 @@ fn update(args: &LearnArgs, old: &Path) -> anyhow::Result<()> {
     describe(&skill);
     say!(
         "refined by {}, saved to {}",
-        plural(demonstrations.len(), "demonstration"),
+        plural(demonstrations.len(), "demonstration", "demonstrations"),
         path.display()
     );
     Ok(())
-}
-
-fn plural(n: usize, what: &str) -> String {
-    format!("{n} {what}{}", if n == 1 { "" } else { "s" })
 }
 
 pub(crate) fn inspect(args: &InspectArgs) -> anyhow::Result<()> {

@@ -175,11 +175,7 @@ async fn operate(args: Args) -> anyhow::Result<()> {
             save: args.save.clone(),
         },
         shown,
-        patience: Duration::from_secs_f64(
-            args.patience
-                .unwrap_or(settings::PATIENCE_S)
-                .clamp(0.1, 3600.0),
-        ),
+        patience: Duration::from_secs_f64(args.patience.unwrap_or(settings::PATIENCE_S)),
     };
     let (notices, heard) = mpsc::unbounded_channel();
     let progress = std::io::stderr().is_terminal() && !args.json;
@@ -255,7 +251,7 @@ fn make_task(
 ) -> anyhow::Result<(Task, Option<Played>)> {
     match (&args.replay[..], &args.play) {
         ([first, then @ ..], None) => {
-            let rest_s = args.rest.unwrap_or(settings::REST_S).clamp(0.0, 60.0);
+            let rest_s = args.rest.unwrap_or(settings::REST_S);
             let recording = |path: &PathBuf| -> anyhow::Result<Recording> {
                 let samples = skills.unseen(path)?.samples().to_vec();
                 Ok(Recording { samples, rest_s })

@@ -191,9 +191,9 @@ impl Daemon {
                 }
             }
         }
-        if lessons.is_busy() {
-            let lesson = lessons.finished().await;
-            self.learned(lesson, &lessons, task, notices);
+        while lessons.is_at_work() {
+            let news = lessons.news().await;
+            self.news(news, &mut lessons, task, notices);
         }
         endpoint.wait_idle().await;
         summary.outcome = task.outcome(*quit.borrow());
@@ -329,8 +329,8 @@ impl Daemon {
                         self.act(act, session, task, lessons, notices);
                     }
                 }
-                lesson = lessons.finished() => {
-                    if let Some(skill) = self.learned(lesson, lessons, task, notices) {
+                news = lessons.news() => {
+                    if let Some(skill) = self.news(news, lessons, task, notices) {
                         session.replace_skill(skill);
                         if let Some(recogniser) = task.person().and_then(|live| live.recogniser()) {
                             session.watch_by(Some(recogniser));

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::skill::Skill;
-use tokio::task::JoinHandle;
+use tokio::task::{JoinHandle, JoinSet};
 
 use crate::cli::{Bounds, infer};
 use crate::demonstration::{Demonstration, DemonstrationError, Sample};
@@ -41,6 +41,11 @@ pub enum LessonError {
     /// The skill cannot be written.
     #[error(transparent)]
     Save(#[from] SkillFileError),
+    /// Its name is none for a file.
+    #[error(
+        "the skill is called {0:?}, which is no name for a file: save it by a path of your own"
+    )]
+    Name(String),
     /// The thread died.
     #[error("refining ended early; the skill is as it was")]
     Died,
@@ -75,6 +80,16 @@ pub struct Lessons {
     kept: Vec<Demonstration>,
     hashes: Vec<[u8; 32]>,
     work: Option<JoinHandle<Lesson>>,
+    writing: JoinSet<Result<PathBuf, SkillFileError>>,
+}
+
+/// What has come of work on another thread.
+#[derive(Debug)]
+pub enum News {
+    /// Of learning.
+    Learned(Box<Result<Lesson, LessonError>>),
+    /// Of writing: the file.
+    Saved(Result<PathBuf, LessonError>),
 }
 
 impl Lessons {
@@ -167,39 +182,69 @@ impl Lessons {
         self.work.is_some()
     }
 
-    /// Waits until the skill is refined; for ever if it is not being refined. May be dropped and called again.
-    ///
-    /// # Errors
-    /// [`LessonError::Died`].
-    pub async fn finished(&mut self) -> Result<Lesson, LessonError> {
-        let Some(work) = &mut self.work else {
-            return std::future::pending().await;
-        };
-        let done = work.await;
-        self.work = None;
-        let lesson = done.map_err(|_| LessonError::Died)?;
-        if let Some(skill) = &lesson.skill {
-            self.skill = Some(Arc::clone(skill));
-        }
-        Ok(lesson)
+    /// Whether something is still being learned or written.
+    pub fn is_at_work(&self) -> bool {
+        self.is_busy() || !self.writing.is_empty()
     }
 
-    /// Writes the skill to a file.
+    /// Waits until something is learned or written; for ever if nothing is under way. May be dropped and called again.
+    pub async fn news(&mut self) -> News {
+        let learned = async {
+            match &mut self.work {
+                Some(work) => work.await,
+                None => std::future::pending().await,
+            }
+        };
+        let written = async {
+            match self.writing.join_next().await {
+                Some(done) => done,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            biased;
+            done = learned => {
+                self.work = None;
+                let lesson = done.map_err(|_| LessonError::Died);
+                if let Ok(Lesson { skill: Some(skill), .. }) = &lesson {
+                    self.skill = Some(Arc::clone(skill));
+                }
+                News::Learned(Box::new(lesson))
+            }
+            done = written => {
+                let done = done.map_err(|_| LessonError::Died);
+                News::Saved(done.and_then(|file| Ok(file?)))
+            }
+        }
+    }
+
+    /// Begins to write the skill to a file: a slow disk holds up nobody.
     ///
     /// # Errors
-    /// [`LessonError`]: there is none, it is being refined, or the file cannot be written.
-    pub fn save(&self, path: &Path) -> Result<(), LessonError> {
-        let skill = self.skill.as_ref().ok_or(LessonError::NoSkill)?;
+    /// [`LessonError`]: there is none, or it is being refined.
+    pub fn save(&mut self, path: &Path) -> Result<(), LessonError> {
+        let skill = self.skill.clone().ok_or(LessonError::NoSkill)?;
         if self.is_busy() {
             return Err(LessonError::Busy);
         }
-        Ok(skill_file::save(skill, path)?)
+        let path = path.to_owned();
+        self.writing.spawn_blocking(move || {
+            skill_file::save(&skill, &path)?;
+            Ok(path)
+        });
+        Ok(())
     }
 
-    /// Where [`Lessons::save`] puts the skill within a folder.
-    pub fn file_in(&self, folder: &Path) -> Option<PathBuf> {
-        let skill = self.skill.as_ref()?;
-        Some(folder.join(format!("{}.skill", skill.name())))
+    /// Begins to write the skill to a file of its name in `folder`.
+    ///
+    /// # Errors
+    /// As [`Lessons::save`], and [`LessonError::Name`] if that would not be a file of the folder.
+    pub fn save_in(&mut self, folder: &Path) -> Result<(), LessonError> {
+        let name = self.skill.as_ref().ok_or(LessonError::NoSkill)?.name();
+        if name.starts_with('.') || name.contains(|c: char| "/\\".contains(c) || c.is_control()) {
+            return Err(LessonError::Name(name.to_owned()));
+        }
+        self.save(&folder.join(format!("{name}.skill")))
     }
 }
 

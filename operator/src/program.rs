@@ -3,9 +3,8 @@
 use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser, Subcommand};
-use telemime_endpoint::admin;
-use telemime_endpoint::cli::one_line;
-use telemime_endpoint::config::{self, CheckArgs};
+use telemime_endpoint::admin::HostCommand;
+use telemime_endpoint::cli::exit_code;
 use telemime_endpoint::peers::Role;
 
 use crate::cli::Args;
@@ -26,10 +25,9 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    Identity(admin::IdentityArgs),
-    Peers(admin::PeersArgs),
     Pair(crate::cli::PairArgs),
-    CheckConfig(CheckArgs),
+    #[command(flatten)]
+    Host(HostCommand),
 }
 
 /// The program's command line, for man pages and completions.
@@ -43,17 +41,8 @@ pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let done = match &cli.command {
         None => crate::cli::run(&cli.args).map(|()| true),
-        Some(Command::Identity(args)) => admin::identity(args, Role::Operator).map(|()| true),
-        Some(Command::Peers(args)) => admin::peers(args).map(|()| true),
         Some(Command::Pair(args)) => crate::cli::pair(args).map(|()| true),
-        Some(Command::CheckConfig(args)) => config::check::<Args>(args, &config::environment()),
+        Some(Command::Host(command)) => command.run::<Args>(Role::Operator),
     };
-    match done {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::from(2),
-        Err(e) => {
-            eprintln!("telemime-operator: {}", one_line(e.chain()));
-            ExitCode::FAILURE
-        }
-    }
+    exit_code("telemime-operator", &done)
 }

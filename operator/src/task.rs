@@ -119,6 +119,8 @@ pub struct Task {
     /// When the robot engaged, as it says.
     begun: Option<Stamp>,
     requests: u32,
+    /// Why the robot would not engage, the last time it was asked.
+    put_off: Option<Refusal>,
     trouble: Option<String>,
     scribe: Option<Scribe>,
 }
@@ -236,6 +238,7 @@ impl Task {
             engaged_at: None,
             begun: None,
             requests: 0,
+            put_off: None,
             trouble: None,
             scribe: None,
         }
@@ -333,7 +336,10 @@ impl Task {
                 self.begun = Some(Stamp(t_us.saturating_mul(1000)));
                 self.engaged_at = Some(now);
             }
-            Event::Refused(Refusal::ClockUnknown | Refusal::Moving | Refusal::StaleReference) => {
+            Event::Refused(
+                reason @ (Refusal::ClockUnknown | Refusal::Moving | Refusal::StaleReference),
+            ) => {
+                self.put_off = Some(*reason);
                 self.phase = Phase::Waiting(Some(now.offset_by_secs(RETRY_S)));
             }
             Event::Refused(Refusal::Diverged) => {}
@@ -433,7 +439,12 @@ impl Task {
                     session.release();
                     self.phase = Phase::Leaving(now.offset_by_secs(LEAVE_S));
                     if self.engaged_at.is_none() && self.trouble.is_none() {
-                        self.trouble = Some("the robot never engaged".into());
+                        self.trouble = Some(match self.put_off {
+                            Some(Refusal::StaleReference) => "the robot never engaged: what it was asked came too late, more than half a second after it was true (protocol.md §4)".into(),
+                            Some(Refusal::ClockUnknown) => "the robot never engaged: it has not found out our clock; do its datagrams arrive?".into(),
+                            Some(reason) => format!("the robot never engaged: {reason:?}, to the last"),
+                            None => "the robot never engaged: it did not answer while the recording lasted".into(),
+                        });
                     }
                 }
             }

@@ -13,8 +13,11 @@ fn main() {
 
 const PARAMS: Params = Params::only([0.7, 0.1, 0.1]);
 
-fn skill() -> Skill {
-    posed_example(14, 24)
+/// Components that are learned: of one person's demonstrations, and with other people's beside them.
+const LEARNED: [usize; 2] = [14, 21];
+
+fn skill(components: usize) -> Skill {
+    posed_example(components, 24)
 }
 
 fn hand() -> HandState {
@@ -29,17 +32,17 @@ fn hand() -> HandState {
     state
 }
 
-/// A message: the forecast of 24 knots by 14 components.
-#[divan::bench]
-fn message(bencher: Bencher) {
-    let (skill, hand) = (skill(), hand());
+/// A message: the forecast of 24 knots.
+#[divan::bench(args = LEARNED)]
+fn message(bencher: Bencher, components: usize) {
+    let (skill, hand) = (skill(components), hand());
     bencher.bench(|| skill.predictor().forecast(black_box(&hand), &PARAMS));
 }
 
 /// The same of the orientation.
-#[divan::bench]
-fn message_turn(bencher: Bencher) {
-    let skill = skill();
+#[divan::bench(args = LEARNED)]
+fn message_turn(bencher: Bencher, components: usize) {
+    let skill = skill(components);
     let turn = &skill.turn().expect("the example turns").predictor;
     let mut state = TurnState::first(Stamp(0), pose::exp(&Vector3::x()));
     for i in 1..40_i64 {
@@ -52,14 +55,14 @@ fn message_turn(bencher: Bencher) {
 /// A tick: one moment of a forecast that is there.
 #[divan::bench]
 fn tick(bencher: Bencher) {
-    let forecast = skill().predictor().forecast(&hand(), &PARAMS);
+    let forecast = skill(LEARNED[1]).predictor().forecast(&hand(), &PARAMS);
     bencher.bench(|| forecast.at(black_box(0.137)));
 }
 
 /// A tick of the orientation.
 #[divan::bench]
 fn tick_turn(bencher: Bencher) {
-    let skill = skill();
+    let skill = skill(LEARNED[1]);
     let turn = &skill.turn().expect("the example turns").predictor;
     let state = TurnState::first(Stamp(0), pose::exp(&Vector3::x()));
     let forecast = turn.forecast(&state, &PARAMS);

@@ -2,10 +2,9 @@
 
 use std::process::ExitCode;
 
-use clap::{CommandFactory, Parser, Subcommand};
-use telemime_endpoint::admin;
-use telemime_endpoint::cli::one_line;
-use telemime_endpoint::config::{self, CheckArgs};
+use clap::{CommandFactory, Parser};
+use telemime_endpoint::admin::HostCommand;
+use telemime_endpoint::cli::exit_code;
 use telemime_endpoint::peers::Role;
 
 use crate::cli::Args;
@@ -19,16 +18,9 @@ use crate::cli::Args;
 )]
 struct Cli {
     #[command(subcommand)]
-    command: Option<Command>,
+    command: Option<HostCommand>,
     #[command(flatten)]
     args: Args,
-}
-
-#[derive(Subcommand)]
-enum Command {
-    Identity(admin::IdentityArgs),
-    Peers(admin::PeersArgs),
-    CheckConfig(CheckArgs),
 }
 
 /// The program's command line, for man pages and completions.
@@ -42,16 +34,7 @@ pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let done = match &cli.command {
         None => crate::cli::run(&cli.args).map(|()| true),
-        Some(Command::Identity(args)) => admin::identity(args, Role::Robot).map(|()| true),
-        Some(Command::Peers(args)) => admin::peers(args).map(|()| true),
-        Some(Command::CheckConfig(args)) => config::check::<Args>(args, &config::environment()),
+        Some(command) => command.run::<Args>(Role::Robot),
     };
-    match done {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::from(2),
-        Err(e) => {
-            eprintln!("telemime-robot: {}", one_line(e.chain()));
-            ExitCode::FAILURE
-        }
-    }
+    exit_code("telemime-robot", &done)
 }

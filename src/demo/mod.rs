@@ -20,6 +20,7 @@ use telemime_sim::hand::swing_with_wrist;
 use telemime_sim::link::parse_duration_s;
 
 use crate::cli::Ways;
+pub(crate) use processes::CutShort;
 
 /// Performances the demo learns from; one more is driven.
 const PERFORMANCES: u32 = 5;

@@ -25,6 +25,11 @@ pub(super) struct Run {
     pub(super) skill: PathBuf,
 }
 
+/// The run was cut short, and the operator, whose stderr is ours, has said why.
+#[derive(Debug, thiserror::Error)]
+#[error("the run was cut short; the operator says why")]
+pub(crate) struct CutShort;
+
 /// A robot that listens, and what an operator needs to call it.
 pub(super) struct Called {
     pub(super) robot: Process,
@@ -152,17 +157,18 @@ pub(super) async fn run(args: &Args, material: &Material, scratch: &Path) -> any
     let stopped = robot.finish(&mut robot_events).await;
     quit.send_replace(true);
     let passages = relaying.await.context("the relay ended early")?;
-    watched?;
-    left?;
-    stopped?;
     let why = operator_events.iter().find_map(|e| match e {
         Operator::Done { why, .. } => Some(why.clone()),
         _ => None,
     });
-    match why {
-        Some(None) => {}
-        Some(Some(why)) => bail!("the run was cut short: {why}"),
-        None => bail!("the operator ended without a result"),
+    if matches!(why, Some(Some(_))) {
+        return Err(CutShort.into());
+    }
+    watched?;
+    left?;
+    stopped?;
+    if why.is_none() {
+        bail!("the operator ended without a result");
     }
     let skill = skills.join(format!("{name}.skill"));
     Ok(Run {

@@ -44,18 +44,28 @@ const LEAST_2: f64 = 1e-8;
 
 /// A predicted way from the newest sample.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Guess {
-    pub(super) way: Vector3<f64>,
+pub(crate) struct Guess {
+    pub(crate) way: Vector3<f64>,
     /// Its covariance, where the predictor states one.
-    pub(super) spread: Option<Matrix3<f64>>,
+    pub(crate) spread: Option<Matrix3<f64>>,
 }
 
 impl Guess {
     /// The squared Mahalanobis distance of what came; `None` without a covariance.
-    pub(super) fn distance2(&self, truth: &Vector3<f64>) -> Option<f64> {
+    pub(crate) fn distance2(&self, truth: &Vector3<f64>) -> Option<f64> {
         let covariance = self.spread? + Matrix3::identity() * LEAST_2;
         let error = self.way - truth;
         Some(error.dot(&covariance.cholesky()?.solve(&error)))
+    }
+}
+
+impl Guess {
+    /// What `ahead` says of `h_s` seconds after the state it starts from.
+    pub(crate) fn of(ahead: &Ahead, h_s: f64) -> Self {
+        Self {
+            way: ahead.at(h_s).displacement,
+            spread: Some(covariance(ahead, h_s)),
+        }
     }
 }
 
@@ -386,10 +396,7 @@ impl Expert for Guard {
 
     fn ahead(&self, h_s: f64) -> Guess {
         match &self.ahead {
-            Some(ahead) => Guess {
-                way: ahead.at(h_s).displacement,
-                spread: Some(covariance(ahead, h_s)),
-            },
+            Some(ahead) => Guess::of(ahead, h_s),
             None => Vector3::zeros().into(),
         }
     }
@@ -408,14 +415,9 @@ const DELAY_S: f64 = 0.1;
 
 impl Guarded {
     fn new(side: Side, skill: &Arc<Skill>, session: &SessionConfig) -> Self {
-        let config = SessionConfig {
-            max_silence_s: 0.0,
-            min_interval_s: 0.0,
-            ..*session
-        };
         Self {
             side,
-            session: Live::new(skill, config, DELAY_S),
+            session: Live::of_every_sample(skill, *session, DELAY_S),
             said: None,
             newest: None,
         }

@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use telemime_operator::session::FutureBound;
+
 use super::dual::Scheme;
 use super::experts::GUARDED;
 use super::report::{Report, Section, nearest};
@@ -93,7 +95,7 @@ fn messages(report: &Report) -> Panel {
             Layer::new("", colour, Shape::Dots(points)),
         ]
     };
-    let session = |silence: Option<f64>| move |s: &Scheme| matches!(s, Scheme::Session(telemime_operator::session::FutureBound::Relative(_), own) if *own == silence);
+    let session = |silence: Option<f64>| move |s: &Scheme| matches!(s, Scheme::Session(FutureBound::Share(_), own) if *own == silence);
     let mut layers = Vec::new();
     layers.extend(series("deadband, held", BLACK, &|s| {
         matches!(s, Scheme::DeadbandHold(_))

@@ -68,6 +68,16 @@ impl Live {
         live
     }
 
+    /// The same, but every sample is said, whatever the robot predicts: what [`Live::take`] gives last is of that sample.
+    pub(crate) fn of_every_sample(skill: &Arc<Skill>, config: SessionConfig, delay_s: f64) -> Self {
+        let config = SessionConfig {
+            max_silence_s: 0.0,
+            min_interval_s: 0.0,
+            ..config
+        };
+        Self::new(skill, config, delay_s)
+    }
+
     fn hears(&mut self, message: &RobotControl) {
         let frame = Frame {
             ignorable: false,

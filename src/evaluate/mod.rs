@@ -27,15 +27,18 @@ use telemime_robot::rig::{Rig, RigOptions};
 use crate::cli::Shape;
 use arm::Drive;
 use dual::Scheme;
+pub(crate) use experts::Guess;
 pub(crate) use kalman::Kalman;
 pub(crate) use live::{Live, on_session_clock};
 use protocol::{Plan, Protocol};
+pub(crate) use score::REGION_90;
 
 /// Bounds on the future that are tried, as shares of what holding errs by …
-const BOUNDS: [f64; 5] = [0.04, 0.08, 0.16, 0.32, 0.64];
+const BOUNDS: [f64; 6] = [0.04, 0.08, 0.16, 0.32, 0.48, 0.64];
 
-/// … and as multiples of the predicted deviation.
-const SIGMAS: [f64; 6] = [0.3, 0.6, 0.8, 1.0, 1.5, 2.0];
+/// … as multiples of the predicted deviation, and as shares of the way the hand usually goes.
+const SIGMAS: [f64; 4] = [0.6, 1.0, 1.5, 2.0];
+const SHARES: [f64; 5] = [0.15, 0.2, 0.3, 0.45, 0.6];
 
 /// Largest silences that are tried, s.
 const SILENCES_S: [Option<f64>; 3] = [Some(0.2), Some(0.3), None];
@@ -217,6 +220,7 @@ fn schemes(sets: &[Demonstrations], delay_s: f64) -> Vec<Scheme> {
     for silence_s in SILENCES_S {
         all.extend(bounds_m.map(|m| Scheme::Session(FutureBound::Absolute(m), silence_s)));
         all.extend(SIGMAS.map(|n| Scheme::Session(FutureBound::Relative(n), silence_s)));
+        all.extend(SHARES.map(|n| Scheme::Session(FutureBound::Share(n), silence_s)));
     }
     all
 }

@@ -199,6 +199,8 @@ pub(super) struct DualRow {
     pub(super) bound_mm: Option<f64>,
     /// The bound as a multiple of the predicted deviation.
     pub(super) bound_sigmas: Option<f64>,
+    /// The bound as a share of the way the hand usually goes.
+    pub(super) bound_share: Option<f64>,
     /// The largest silence, ms.
     pub(super) silence_ms: Option<f64>,
     pub(super) messages_per_s: f64,
@@ -500,7 +502,7 @@ fn quantile(values: &mut [f64], q: f64) -> Option<f64> {
 }
 
 fn dual(plan: &Plan<'_>, performances: &[Performance]) -> Dual {
-    use telemime_operator::session::FutureBound::{Absolute, Relative};
+    use telemime_operator::session::FutureBound::{Absolute, Relative, Share};
     let mut sums = vec![Outcome::default(); plan.schemes.len()];
     for p in performances {
         for (sum, outcome) in sums.iter_mut().zip(&p.dual) {
@@ -510,12 +512,16 @@ fn dual(plan: &Plan<'_>, performances: &[Performance]) -> Dual {
     let everything = plan.schemes.iter().position(|s| *s == Scheme::Everything);
     let hold_m = everything.and_then(|n| sums[n].rmse_m());
     let row = |(scheme, sum): (&Scheme, &Outcome)| {
-        let (name, bound_m, bound_sigmas, silence_s) = match *scheme {
-            Scheme::Everything => ("everything, held", None, None, None),
-            Scheme::DeadbandHold(m) => ("deadband, held", Some(m), None, None),
-            Scheme::DeadbandStraight(m) => ("deadband, velocity", Some(m), None, None),
-            Scheme::Session(Absolute(m), silence) => (GUARDED, Some(m), None, silence),
-            Scheme::Session(Relative(n), silence) => (GUARDED, None, Some(n), silence),
+        let bound = |bound| match bound {
+            Absolute(m) => (Some(m), None, None),
+            Relative(n) => (None, Some(n), None),
+            Share(n) => (None, None, Some(n)),
+        };
+        let (name, (bound_m, bound_sigmas, bound_share), silence_s) = match *scheme {
+            Scheme::Everything => ("everything, held", (None, None, None), None),
+            Scheme::DeadbandHold(m) => ("deadband, held", bound(Absolute(m)), None),
+            Scheme::DeadbandStraight(m) => ("deadband, velocity", bound(Absolute(m)), None),
+            Scheme::Session(future, silence) => (GUARDED, bound(future), silence),
         };
         let session = matches!(scheme, Scheme::Session(..));
         DualRow {
@@ -523,6 +529,7 @@ fn dual(plan: &Plan<'_>, performances: &[Performance]) -> Dual {
             name,
             bound_mm: bound_m.map(ms),
             bound_sigmas,
+            bound_share,
             silence_ms: silence_s.map(ms),
             messages_per_s: sum.messages as f64 / sum.duration_s,
             bytes_per_s: session.then(|| sum.bytes as f64 / sum.duration_s),

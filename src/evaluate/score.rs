@@ -6,7 +6,10 @@ use telemime_operator::demonstration::Demonstration;
 use super::experts::{Expert, Guess, Side};
 
 /// The regions whose coverage is counted, and the quantiles of χ² with three degrees of freedom.
-pub(super) const REGIONS: [(f64, f64); 3] = [(0.5, 2.366), (0.9, 6.251), (0.95, 7.815)];
+pub(super) const REGIONS: [(f64, f64); 3] = [(0.5, 2.366), (0.9, REGION_90), (0.95, 7.815)];
+
+/// The quantile at 90 %.
+pub(crate) const REGION_90: f64 = 6.251;
 
 /// Shifts at which the lag is sought: from this much early …
 const FIRST_SHIFT_S: f64 = -0.1;

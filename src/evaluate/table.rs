@@ -232,11 +232,10 @@ fn dual(out: &mut String, report: &Report) {
 }
 
 fn bound(row: &DualRow) -> String {
-    match (row.bound_mm, row.bound_sigmas) {
-        (Some(mm), _) => format!("{mm} mm"),
-        (None, Some(n)) => format!("{n} σ"),
-        (None, None) => String::new(),
-    }
+    let mm = row.bound_mm.map(|mm| format!("{mm} mm"));
+    let sigmas = row.bound_sigmas.map(|n| format!("{n} σ"));
+    let share = row.bound_share.map(|n| format!("{n} way"));
+    mm.or(sigmas).or(share).unwrap_or_default()
 }
 
 fn arm(out: &mut String, report: &Report) {

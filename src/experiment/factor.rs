@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use telemime_operator::session::FutureBound;
+use telemime_operator::session::{FutureBound, MAX_LEASE_S, MAX_SILENCE_S};
 use telemime_sim::link::{LinkConfig, parse_duration_s};
 
 use super::method::Method;
@@ -83,8 +83,8 @@ pub(super) const FACTORS: [Factor; 16] = [
     ),
     factor(
         "future",
-        &["1 sigma"],
-        "bound on the future: a distance, or sigmas of what is predicted",
+        &["0.2 way"],
+        "bound on the future: a share of the way the hand usually goes, a distance, or sigmas of what is predicted",
         OURS,
     ),
     factor("path", &["auto"], "bound on the path, a distance", OURS),
@@ -140,7 +140,7 @@ pub(super) fn of<'a>(texts: &'a Texts, name: &str) -> &'a str {
 pub(super) fn seen_by(texts: &Texts, method: Method) -> Texts {
     let whom = match method {
         Method::Ours => 0,
-        Method::Hold | Method::Deadband(_) | Method::Velocity | Method::Kalman => 1,
+        Method::Hold | Method::Deadband(_) | Method::Velocity(_) | Method::Kalman => 1,
         Method::Playback => 2,
         Method::Floor => 3,
     };
@@ -182,6 +182,18 @@ impl Settings {
             text => text,
         };
         let seconds = |name: &str| parse_duration_s(text(name)).map_err(|e| e.to_string());
+        let silence_s = within(
+            seconds("silence")?,
+            0.005,
+            MAX_SILENCE_S,
+            "5ms to 250ms, as an operator takes",
+        )?;
+        let lease_s = seconds("lease")?;
+        if !(lease_s > silence_s && lease_s <= MAX_LEASE_S) {
+            return Err(
+                "a lease is longer than the silence, and at most 1s: a robot grants no more".into(),
+            );
+        }
         Ok(Self {
             on_model: match text("motion") {
                 "on-model" => true,
@@ -195,8 +207,8 @@ impl Settings {
             input_latency_s: within(seconds("input_latency")?, 0.0, 1.0, "0ms to 1s")?,
             future: future(text("future"))?,
             path_m: auto(text("path"), distance_m)?,
-            silence_s: within(seconds("silence")?, 0.01, 10.0, "10ms to 10s")?,
-            lease_s: within(seconds("lease")?, 0.01, 10.0, "10ms to 10s")?,
+            silence_s,
+            lease_s,
             omega: within(number(text("bandwidth"))?, 1.0, 200.0, "1 to 200")?,
             dead_time_s: within(seconds("dead_time")?, 0.0, 0.05, "0ms to 50ms")?,
             arm: arm(text("arm"), folder)?,
@@ -240,14 +252,15 @@ fn auto<T>(text: &str, read: impl Fn(&str) -> Result<T, String>) -> Result<Optio
 }
 
 fn future(text: &str) -> Result<FutureBound, String> {
-    match text.strip_suffix("sigma") {
-        Some(n) => {
-            let n = within(number(n)?, 0.01, 100.0, "0.01 to 100 sigma")?;
-            Ok(FutureBound::Relative(n))
-        }
-        None => distance_m(text)
+    let times = |n: &str, what| within(number(n)?, 0.01, 100.0, what);
+    if let Some(n) = text.strip_suffix("way") {
+        times(n, "0.01 to 100 way").map(FutureBound::Share)
+    } else if let Some(n) = text.strip_suffix("sigma") {
+        times(n, "0.01 to 100 sigma").map(FutureBound::Relative)
+    } else {
+        distance_m(text)
             .map(FutureBound::Absolute)
-            .map_err(|_| "write `1 sigma` or a distance, for example 20mm".into()),
+            .map_err(|_| "write `0.2 way`, `1 sigma` or a distance, for example 20mm".into())
     }
 }
 

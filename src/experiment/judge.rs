@@ -12,7 +12,7 @@ use super::figures::{Figures, HORIZONS_S};
 use super::method::{Method, Sender};
 use super::subject::Subject;
 use super::trace::{Outcome, Tick, Trace};
-use crate::evaluate::{Live, on_session_clock};
+use crate::evaluate::{Guess, Live, REGION_90, on_session_clock};
 use crate::measure::{
     Passing, Spread, Track, Turns, amplitude_gain, off_path, overshoots, quantile, rms, shift,
     smooth_jerk_m_s3,
@@ -39,9 +39,6 @@ const STILL_M: f64 = 1e-4;
 
 /// A stop that begins this long after the outage's end is another's, s: the last of the lease, and the arm's.
 const AFTER_S: f64 = 1.0;
-
-/// χ² with three degrees of freedom at 90 %.
-const CHI2_90: f64 = 6.251_388_631;
 
 /// One moment of a run, for figures.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -170,7 +167,8 @@ fn wire(figures: &mut Figures, trace: &Trace, end_s: f64) {
     }
 }
 
-/// What the operator predicts from each sample (ours: from each message), without network and arm.
+/// What the operator predicts from each sample, without network and arm. Ours from each sample too, not only from those it
+/// speaks of: it speaks when a prediction has failed, so that its messages are a choice of the hard moments.
 fn prediction(
     figures: &mut Figures,
     settings: &Settings,
@@ -181,13 +179,12 @@ fn prediction(
     let end_s = d.last().t_s;
     let mut errors: [Vec<f64>; 4] = Default::default();
     let mut held = [0_u32; 4];
-    let mut judge = |from_s: f64, ahead: &dyn Fn(f64) -> (Vector3<f64>, Option<f64>)| {
+    let mut judge = |from_s: f64, from: Vector3<f64>, ahead: &dyn Fn(f64) -> Guess| {
         for (n, h_s) in HORIZONS_S.iter().enumerate() {
             if from_s + h_s <= end_s {
-                let (place, sigma_m) = ahead(*h_s);
-                let error = (place - d.position_at(from_s + h_s)).norm();
-                errors[n].push(error);
-                let within = sigma_m.is_some_and(|s| error * error <= CHI2_90 * s * s);
+                let (guess, truth) = (ahead(*h_s), d.position_at(from_s + h_s) - from);
+                errors[n].push((guess.way - truth).norm());
+                let within = guess.distance2(&truth).is_some_and(|d2| d2 <= REGION_90);
                 held[n] += u32::from(within);
             }
         }
@@ -199,23 +196,23 @@ fn prediction(
                 input_latency_s: 0.0,
                 ..session(settings, axes)
             };
-            let mut live = Live::new(&subject.skill, config, 0.0);
+            let mut live = Live::of_every_sample(&subject.skill, config, 0.0);
             for sample in d.samples() {
-                for said in live.take(sample) {
+                if let Some(said) = live.take(sample).pop() {
                     let since_s = said.place.t.secs_since(on_session_clock(0.0));
-                    judge(since_s, &|h_s| {
-                        let seen = said.place.at(h_s);
-                        (seen.position, Some(seen.sigma_m))
+                    judge(since_s, said.place.x, &|h_s| {
+                        Guess::of(&said.place.ahead, h_s)
                     });
                 }
             }
         }
-        Method::Hold | Method::Velocity | Method::Kalman => {
+        Method::Hold | Method::Velocity(_) | Method::Kalman => {
             let mut sender = Sender::new(settings.method, &subject.kalman);
             for sample in d.samples() {
                 if let Some(message) = sender.take(sample) {
                     let ahead = |h_s| message.hand(settings.method, h_s, 0.0, 0.0).place;
-                    judge(sample.t_s, &|h_s| (ahead(h_s), None));
+                    let from = sample.position;
+                    judge(sample.t_s, from, &|h_s| (ahead(h_s) - from).into());
                 }
             }
         }

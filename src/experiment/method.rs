@@ -12,8 +12,8 @@ use telemime_protocol::time::Stamp;
 use crate::evaluate::Kalman;
 use crate::measure::Hand;
 
-/// What QUIC, UDP and IP add to a datagram, bytes: as much as they add to ours.
-pub(super) const HEADERS: usize = 58;
+/// What QUIC, UDP and IP add to a datagram, bytes: as much as they add to ours (`tests/it/overhead.rs` counts it).
+pub(super) const HEADERS: usize = 53;
 
 /// Nothing is predicted farther than our predictor's last knot, s.
 const FARTHEST_S: f64 = 0.8;
@@ -34,8 +34,8 @@ pub(super) enum Method {
     /// Weber's deadband on velocity: a sample is sent when the hand's velocity differs from the one sent last by more than
     /// this share of it; between messages the robot goes on at the velocity received, as late as the link is.
     Deadband(f64),
-    /// Every sample with its velocity; the robot extrapolates by the sample's age and the arm's lag.
-    Velocity,
+    /// Every sample with its velocity; the robot extrapolates by the sample's age and the arm's lag, at this share of it.
+    Velocity(f64),
     /// The same with the state of a Kalman filter of constant acceleration.
     Kalman,
     /// The publication's: the skill's inferred motion, sent once as checkpoints and played.
@@ -51,7 +51,8 @@ impl fmt::Display for Method {
             Self::Hold => "hold",
             Self::Deadband(share) if *share == SHARE => "deadband",
             Self::Deadband(share) => return write!(f, "deadband {}%", share * 100.0),
-            Self::Velocity => "velocity",
+            Self::Velocity(share) if *share == 1.0 => "velocity",
+            Self::Velocity(share) => return write!(f, "velocity {}%", share * 100.0),
             Self::Kalman => "kalman",
             Self::Playback => "playback",
             Self::Floor => "floor",
@@ -63,21 +64,26 @@ impl FromStr for Method {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        if let Some(share) = text.strip_prefix("deadband ") {
-            let share = telemime_sim::link::parse_probability(share).map_err(|e| e.to_string())?;
-            return Ok(Self::Deadband(share));
+        for (name, method) in [
+            ("deadband ", Self::Deadband as fn(f64) -> Self),
+            ("velocity ", Self::Velocity),
+        ] {
+            if let Some(share) = text.strip_prefix(name) {
+                let share = telemime_sim::link::parse_probability(share);
+                return share.map(method).map_err(|e| e.to_string());
+            }
         }
         Ok(match text {
             "ours" => Self::Ours,
             "hold" => Self::Hold,
             "deadband" => Self::Deadband(SHARE),
-            "velocity" => Self::Velocity,
+            "velocity" => Self::Velocity(1.0),
             "kalman" => Self::Kalman,
             "playback" => Self::Playback,
             "floor" => Self::Floor,
             _ => {
                 return Err(
-                    "write ours, hold, deadband [SHARE], velocity, kalman, playback or floor"
+                    "write ours, hold, deadband [SHARE], velocity [SHARE], kalman, playback or floor"
                         .into(),
                 );
             }
@@ -106,7 +112,7 @@ impl Message {
     pub(super) fn hand(&self, method: Method, age_s: f64, late_s: f64, lag_s: f64) -> Hand {
         let h_s = match method {
             Method::Deadband(_) => (age_s - late_s).clamp(0.0, FARTHEST_S),
-            Method::Velocity | Method::Kalman => (age_s + lag_s).clamp(0.0, FARTHEST_S),
+            Method::Velocity(_) | Method::Kalman => (age_s + lag_s).clamp(0.0, FARTHEST_S),
             Method::Ours | Method::Hold | Method::Playback | Method::Floor => 0.0,
         };
         Hand {
@@ -162,7 +168,9 @@ impl Sender {
                 self.said = Some(velocity);
                 (sample.position, velocity, zero, turning, 7)
             }
-            Method::Velocity => (sample.position, velocity, zero, turning, 7),
+            Method::Velocity(share) => {
+                (sample.position, velocity * share, zero, turning * share, 7)
+            }
             Method::Kalman => {
                 let [x, v, a] = self.kalman.take_motion(sample);
                 (x, v, a, turning, 10)
@@ -214,6 +222,7 @@ mod tests {
         for (text, late_m) in [
             ("hold", 0.1 * speed),
             ("velocity", -0.05 * speed),
+            ("velocity 50%", 0.025 * speed),
             ("kalman", -0.05 * speed),
             ("deadband", 0.1 * speed),
         ] {
@@ -242,13 +251,14 @@ mod tests {
 
     #[test]
     fn nothing_is_predicted_beyond_the_last_knot() {
-        let mut sender = Sender::new(Method::Velocity, &Kalman::tuned(&[]));
+        let mut sender = Sender::new(Method::Velocity(1.0), &Kalman::tuned(&[]));
         let last = samples(1.0)
             .iter()
             .filter_map(|s| sender.take(s))
             .last()
             .unwrap();
-        let [near, far] = [0.8, 60.0].map(|age| last.hand(Method::Velocity, age, 0.1, 0.0).place);
+        let [near, far] =
+            [0.8, 60.0].map(|age| last.hand(Method::Velocity(1.0), age, 0.1, 0.0).place);
         assert_eq!(near, far);
     }
 }

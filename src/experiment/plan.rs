@@ -55,6 +55,8 @@ pub(super) struct Motion {
     pub(super) persons: PersonPattern,
     /// Most recordings of a person that a skill is learned from.
     pub(super) learn_from: usize,
+    /// Each recording is driven, and not each person's last only.
+    pub(super) every: bool,
     pub(super) axes: Axes,
     /// Only so many subjects.
     pub(super) most: Option<usize>,
@@ -71,6 +73,7 @@ impl Default for Motion {
             matching: None,
             persons: PersonPattern::default(),
             learn_from: 3,
+            every: false,
             axes: Axes::Kinect,
             most: None,
         }
@@ -239,10 +242,13 @@ impl Reader<'_> {
             match name {
                 "people" => motion.people = self.count(name, value, 1)?,
                 "performances" => motion.performances = self.count(name, value, 1)? as u32,
-                "wrist" => {
+                "wrist" | "every" => {
                     let flag = value.get_ref().as_bool();
-                    motion.wrist =
-                        flag.ok_or_else(|| self.type_of(value, name, "true or false"))?;
+                    let flag = flag.ok_or_else(|| self.type_of(value, name, "true or false"))?;
+                    match &*name {
+                        "wrist" => motion.wrist = flag,
+                        _ => motion.every = flag,
+                    }
                 }
                 "folders" => motion.folders = self.folders(name, value)?,
                 "off_model" => motion.off_model = self.folders(name, value)?,
@@ -263,7 +269,7 @@ impl Reader<'_> {
                     }
                 }
                 other => {
-                    let known = "people, performances, wrist; or folders, off_model, match, group_by, learn_from, axes";
+                    let known = "people, performances, wrist; or folders, off_model, match, group_by, learn_from, every, axes";
                     return Err(self.unknown(key.span(), other, known));
                 }
             }

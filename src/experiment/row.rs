@@ -45,7 +45,8 @@ impl Row {
         fields.extend(self.texts.iter().cloned());
         fields.push(self.outcome.clone());
         let figures = self.figures.values().into_iter();
-        fields.extend(figures.map(|value| value.map_or(String::new(), |v| v.to_string())));
+        let text = |v: f64| v.is_finite().then(|| v.to_string());
+        fields.extend(figures.map(|value| value.and_then(text).unwrap_or_default()));
         fields
     }
 
@@ -61,7 +62,7 @@ impl Row {
             .iter()
             .map(|text| match *text {
                 "" => Some(None),
-                text => text.parse().ok().map(Some),
+                text => text.parse().ok().filter(|v: &f64| v.is_finite()).map(Some),
             })
             .collect::<Option<_>>()?;
         Some(Self {
@@ -117,7 +118,10 @@ mod tests {
             .has_headers(false)
             .from_reader(&line[..]);
         let record = reader.records().next().unwrap().unwrap();
-        assert_eq!(Row::from_fields(&record), Some(row));
+        assert_eq!(Row::from_fields(&record), Some(row.clone()));
         assert_eq!(Row::from_fields(["1", "2"]), None);
+        let mut endless = row.fields();
+        *endless.last_mut().unwrap() = "1e999".into();
+        assert_eq!(Row::from_fields(endless.iter().map(String::as_str)), None);
     }
 }

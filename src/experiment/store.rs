@@ -17,6 +17,10 @@ pub(super) const MANIFEST: &str = "manifest.json";
 pub(super) const PLAN: &str = "plan.toml";
 /// Runs done so far, in the order they were finished.
 const PART: &str = "part.csv";
+/// The shard that is all there is.
+const ALL: &str = "1/1";
+/// Empty; locked by who writes there.
+const LOCK: &str = ".lock";
 /// The courses of a few runs.
 const SERIES: &str = "series";
 
@@ -78,7 +82,9 @@ impl Host {
 pub(super) enum StoreError {
     #[error("{path}: {source}")]
     Io { path: PathBuf, source: io::Error },
-    #[error("{0}: not a folder of results: there is no {MANIFEST}; choose an empty folder with -o")]
+    #[error(
+        "{0}: not a folder of results: there is no {MANIFEST}; `telemime experiment PLAN -o DIR` makes one"
+    )]
     NotOurs(PathBuf),
     #[error("{path}: {source}; it was not written by this program, or not to its end")]
     Manifest {
@@ -94,8 +100,18 @@ pub(super) enum StoreError {
         there: String,
         here: String,
     },
-    #[error("{path}:{line}: not a result of this plan; move the file away to begin again")]
+    #[error(
+        "{path}:{line}: not a result of this plan; move the file away to begin again, or run the plan into another folder"
+    )]
     Row { path: PathBuf, line: usize },
+    #[error(
+        "{path}: run {run} of {runs} is not there, or there twice: the file was cut or changed; run the plan again into another folder"
+    )]
+    Incomplete {
+        path: PathBuf,
+        run: usize,
+        runs: usize,
+    },
     #[error("{0}: another process is writing there")]
     Busy(PathBuf),
     #[error(
@@ -122,6 +138,8 @@ fn io_at(path: &Path) -> impl FnOnce(io::Error) -> StoreError + use<> {
 pub(super) struct Store {
     dir: PathBuf,
     part: File,
+    /// Nobody else writes there while it is held.
+    _lock: File,
     /// Runs finished before.
     pub(super) done: Vec<Row>,
     /// The run that was being written when it ended, if there was one.
@@ -139,44 +157,28 @@ pub(super) enum Found {
 impl Store {
     /// Opens `dir` for the runs of `manifest`, or makes it. What another plan, or another version, wrote there is refused.
     pub(super) fn open(dir: &Path, manifest: &Manifest, plan: &str) -> Result<Found, StoreError> {
+        if let Some(rows) = complete(dir, manifest)? {
+            return Ok(Found::Complete(rows));
+        }
         std::fs::create_dir_all(dir.join(SERIES)).map_err(io_at(dir))?;
-        let path = dir.join(MANIFEST);
-        if path.exists() {
-            let there = read_manifest(dir)?;
-            let other = |what, there: &str, here: &str| StoreError::Other {
-                dir: dir.to_owned(),
-                what,
-                there: there.to_owned(),
-                here: here.to_owned(),
-            };
-            for (what, a, b) in [
-                ("plan", &there.plan_sha256, &manifest.plan_sha256),
-                ("shard", &there.shard, &manifest.shard),
-                ("version", &there.version, &manifest.version),
-                ("part of the plan", &there.part(), &manifest.part()),
-            ] {
-                if a != b {
-                    return Err(other(what, a, b));
-                }
-            }
-            if there.inputs != manifest.inputs {
-                return Err(other("state of the plan's files", "changed", "since"));
-            }
-            if dir.join(RESULTS).exists() {
-                return Ok(Found::Complete(read_rows(&dir.join(RESULTS))?));
-            }
-        } else {
-            if dir.join(RESULTS).exists() || dir.join(PART).exists() {
-                return Err(StoreError::NotOurs(dir.to_owned()));
-            }
+        let path = dir.join(LOCK);
+        let lock = File::create(&path).map_err(io_at(&path))?;
+        if lock.try_lock().is_err() {
+            return Err(StoreError::Busy(dir.to_owned()));
+        }
+        // Whoever held the lock may have begun, or finished, since.
+        if let Some(rows) = complete(dir, manifest)? {
+            return Ok(Found::Complete(rows));
+        }
+        if !dir.join(MANIFEST).exists() {
             write_whole(&dir.join(PLAN), plan.as_bytes())?;
             write_manifest(dir, manifest)?;
         }
-        Self::part(dir).map(|store| Found::Open(Box::new(store)))
+        Self::part(dir, lock).map(|store| Found::Open(Box::new(store)))
     }
 
     /// The journal: whole lines are kept, the last one may be half written.
-    fn part(dir: &Path) -> Result<Self, StoreError> {
+    fn part(dir: &Path, lock: File) -> Result<Self, StoreError> {
         let path = dir.join(PART);
         let file = OpenOptions::new()
             .read(true)
@@ -184,18 +186,21 @@ impl Store {
             .create(true)
             .open(&path)
             .map_err(io_at(&path))?;
-        if file.try_lock().is_err() {
-            return Err(StoreError::Busy(dir.to_owned()));
-        }
-        let text = std::fs::read_to_string(&path).map_err(io_at(&path))?;
-        let whole = text.rfind('\n').map_or(0, |at| at + 1);
-        let half = text[whole..].split(',').nth(1).map(str::to_owned);
-        let half = half.or_else(|| (whole < text.len()).then(|| "the last one".to_owned()));
+        let bytes = std::fs::read(&path).map_err(io_at(&path))?;
+        let whole = bytes
+            .iter()
+            .rposition(|b| *b == b'\n')
+            .map_or(0, |at| at + 1);
+        let (lines, rest) = bytes.split_at(whole);
+        let half = String::from_utf8_lossy(rest);
+        let half = half.split(',').nth(1).map(str::to_owned);
+        let half = half.or_else(|| (!rest.is_empty()).then(|| "the last one".to_owned()));
         file.set_len(whole as u64).map_err(io_at(&path))?;
-        let done = parse_rows(&path, &text[..whole], false)?;
+        let done = parse_rows(&path, lines, false)?;
         Ok(Self {
             dir: dir.to_owned(),
             part: file,
+            _lock: lock,
             done,
             half,
         })
@@ -232,9 +237,71 @@ impl Store {
     pub(super) fn finish(self, mut rows: Vec<Row>) -> Result<(), StoreError> {
         rows.sort_by_key(|row| row.run);
         write_results(&self.dir, &rows)?;
-        let path = self.dir.join(PART);
-        std::fs::remove_file(&path).map_err(io_at(&path))
+        // The lock last, and while it is held: whoever takes what is gone sees that all is done.
+        for path in [self.dir.join(PART), self.dir.join(LOCK)] {
+            std::fs::remove_file(&path).map_err(io_at(&path))?;
+        }
+        Ok(())
     }
+}
+
+/// The results that are to be had in `dir`, if all are there; an error if what is there is of something else.
+fn complete(dir: &Path, manifest: &Manifest) -> Result<Option<Vec<Row>>, StoreError> {
+    if !dir.join(MANIFEST).exists() {
+        if dir.join(RESULTS).exists() || dir.join(PART).exists() {
+            return Err(StoreError::NotOurs(dir.to_owned()));
+        }
+        return Ok(None);
+    }
+    let there = read_manifest(dir)?;
+    let other = |what, there: &str, here: &str| StoreError::Other {
+        dir: dir.to_owned(),
+        what,
+        there: there.to_owned(),
+        here: here.to_owned(),
+    };
+    for (what, a, b) in [
+        ("plan", &there.plan_sha256, &manifest.plan_sha256),
+        ("shard", &there.shard, &manifest.shard),
+        ("version", &there.version, &manifest.version),
+        ("part of the plan", &there.part(), &manifest.part()),
+    ] {
+        if a != b {
+            return Err(other(what, a, b));
+        }
+    }
+    if there.inputs != manifest.inputs {
+        return Err(other("state of the plan's files", "changed", "since"));
+    }
+    let results = dir.join(RESULTS);
+    results
+        .exists()
+        .then(|| whole(&results, &there))
+        .transpose()
+}
+
+/// All that a finished folder is to hold; a shard knows only how many runs there are at most.
+fn whole(path: &Path, manifest: &Manifest) -> Result<Vec<Row>, StoreError> {
+    let rows = read_rows(path)?;
+    let runs = manifest.runs;
+    let incomplete = |run| StoreError::Incomplete {
+        path: path.to_owned(),
+        run,
+        runs,
+    };
+    let mut seen = std::collections::BTreeSet::new();
+    if let Some(row) = rows
+        .iter()
+        .find(|row| row.run > runs || !seen.insert(row.run))
+    {
+        return Err(incomplete(row.run));
+    }
+    if manifest.shard == ALL
+        && let Some(run) = (1..=runs).find(|run| !seen.contains(run))
+    {
+        return Err(incomplete(run));
+    }
+    Ok(rows)
 }
 
 /// Where the course of a run is.
@@ -254,7 +321,32 @@ pub(super) fn read(dir: &Path) -> Result<(Manifest, String, Vec<Row>), StoreErro
     }
     let path = dir.join(PLAN);
     let plan = std::fs::read_to_string(&path).map_err(io_at(&path))?;
-    Ok((manifest, plan, read_rows(&results)?))
+    let rows = whole(&results, &manifest)?;
+    for row in &rows {
+        check_series(&series_path(dir, &row.id))?;
+    }
+    Ok((manifest, plan, rows))
+}
+
+/// Whether a course, if there is one, has nothing but numbers in every line.
+fn check_series(path: &Path) -> Result<(), StoreError> {
+    if !path.exists() {
+        return Ok(());
+    }
+    let bytes = std::fs::read(path).map_err(io_at(path))?;
+    let mut reader = csv::Reader::from_reader(&bytes[..]);
+    let number = |text: &str| text.is_empty() || text.parse().is_ok_and(f64::is_finite);
+    let ends = bytes.ends_with(b"\n");
+    let wrong = reader
+        .records()
+        .position(|record| !record.is_ok_and(|record| record.iter().all(number)));
+    match wrong.or((!ends).then(|| bytes.split(|b| *b == b'\n').count() - 2)) {
+        Some(n) => Err(StoreError::Row {
+            path: path.to_owned(),
+            line: n + 2,
+        }),
+        None => Ok(()),
+    }
 }
 
 /// Puts the shards of one plan together in a new folder.
@@ -325,7 +417,7 @@ pub(super) fn merge(out: &Path, dirs: &[PathBuf]) -> Result<usize, StoreError> {
             write_whole(&series_path(out, &row.id), &bytes)?;
         }
     }
-    manifest.shard = "1/1".into();
+    manifest.shard = ALL.into();
     write_whole(&out.join(PLAN), plan.as_bytes())?;
     write_manifest(out, &manifest)?;
     let rows: Vec<Row> = rows.into_values().map(|(row, _)| row).collect();
@@ -354,15 +446,15 @@ fn read_manifest(dir: &Path) -> Result<Manifest, StoreError> {
 }
 
 fn read_rows(path: &Path) -> Result<Vec<Row>, StoreError> {
-    let text = std::fs::read_to_string(path).map_err(io_at(path))?;
-    parse_rows(path, &text, true)
+    let bytes = std::fs::read(path).map_err(io_at(path))?;
+    parse_rows(path, &bytes, true)
 }
 
-fn parse_rows(path: &Path, text: &str, header: bool) -> Result<Vec<Row>, StoreError> {
+fn parse_rows(path: &Path, bytes: &[u8], header: bool) -> Result<Vec<Row>, StoreError> {
     let mut reader = csv::ReaderBuilder::new()
         .has_headers(false)
         .flexible(true)
-        .from_reader(text.as_bytes());
+        .from_reader(bytes);
     let mut rows = Vec::new();
     for (n, record) in reader.records().enumerate() {
         let wrong = || StoreError::Row {
@@ -381,12 +473,16 @@ fn parse_rows(path: &Path, text: &str, header: bool) -> Result<Vec<Row>, StoreEr
     Ok(rows)
 }
 
-/// Whole, or not at all.
+/// Whole, or not at all, even if the power fails.
 pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), StoreError> {
     let mut half = path.as_os_str().to_owned();
     half.push(".half");
     let half = PathBuf::from(half);
-    std::fs::write(&half, bytes)
-        .and_then(|()| std::fs::rename(&half, path))
-        .map_err(io_at(path))
+    let write = || {
+        let mut file = File::create(&half)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        std::fs::rename(&half, path)
+    };
+    write().map_err(io_at(path))
 }

@@ -172,7 +172,7 @@ fn made(
     Ok(Demonstration::from_samples(name, &samples)?)
 }
 
-/// Each person of each folder: the last recording is driven, those before it are learned from.
+/// Each person of each folder: the last recording is driven, or each; of the others the first are learned from.
 fn recorded(motion: &Motion, seed: u64) -> Result<Vec<Material>, SubjectError> {
     let read = |dirs: &[std::path::PathBuf], matching: Option<&str>| {
         dirs.iter()
@@ -198,14 +198,20 @@ fn recorded(motion: &Motion, seed: u64) -> Result<Vec<Material>, SubjectError> {
                 pattern: motion.persons.to_string(),
             });
         }
-        for (who, of) in people {
-            let (driven, before) = of.split_last().expect("more than one is kept");
-            let learn: Vec<_> = before
-                .iter()
-                .copied()
-                .take(motion.learn_from)
-                .cloned()
-                .collect();
+        let driven = |(who, of): (&'_ str, Vec<&'_ Demonstration>)| {
+            let first = if motion.every { 0 } else { of.len() - 1 };
+            (first..of.len())
+                .map(|n| {
+                    let others = of.iter().enumerate().filter(|(m, _)| *m != n);
+                    let learn: Vec<_> = others
+                        .map(|(_, d)| (*d).clone())
+                        .take(motion.learn_from)
+                        .collect();
+                    (who.to_owned(), of[n].clone(), learn)
+                })
+                .collect::<Vec<_>>()
+        };
+        for (who, driven, learn) in people.into_iter().flat_map(driven) {
             // The same person with another motion, if there is one; then anybody; then a generated one.
             let rest = sets.iter().enumerate().filter(|(other, _)| *other != n);
             let strange: Vec<_> = others
@@ -218,16 +224,23 @@ fn recorded(motion: &Motion, seed: u64) -> Result<Vec<Material>, SubjectError> {
                         .all(|own| own.sha256() != d.sha256())
                 })
                 .collect();
-            let own = strange.iter().find(|d| motion.persons.person(d) == who);
+            let own = strange
+                .iter()
+                .find(|d| motion.persons.person(d) == who.as_str());
             let off_model = match own.or(strange.first()) {
                 Some(d) => (*d).clone(),
                 None => chop(seed, driven.has_orientation())?,
             };
+            let name = format!("{} by {who}", set.name);
             all.push(Material {
-                name: format!("{} by {who}", set.name),
-                person: who.to_owned(),
+                name: if motion.every {
+                    format!("{name}, {}", driven.name())
+                } else {
+                    name
+                },
+                person: who,
                 learn,
-                on_model: (*driven).clone(),
+                on_model: driven,
                 off_model,
             });
         }
@@ -259,5 +272,39 @@ mod tests {
         assert_eq!(people[1].on_model.sha256(), again[1].on_model.sha256());
         let other = generated(&plan(5)).unwrap();
         assert_ne!(people[1].on_model.sha256(), other[1].on_model.sha256());
+    }
+
+    #[test]
+    fn of_recordings_the_last_is_driven_or_each_and_never_learned_from() {
+        let dir = tempfile::tempdir().unwrap();
+        let plan = |every: bool| {
+            let text = format!("[motion]\nfolders = [\"wave\"]\nlearn_from = 2\nevery = {every}\n");
+            Plan::parse("a", &text, dir.path()).unwrap()
+        };
+        let folder = dir.path().join("wave");
+        std::fs::create_dir(&folder).unwrap();
+        for index in 0..4 {
+            let d = made("x", 7, index, false, false).unwrap();
+            std::fs::write(folder.join(format!("{index}.csv")), d.to_csv()).unwrap();
+        }
+        let last = recorded(&plan(false).motion, 1).unwrap();
+        assert_eq!(last.len(), 1);
+        assert_eq!(last[0].learn.len(), 2);
+        let every = recorded(&plan(true).motion, 1).unwrap();
+        assert_eq!(every.len(), 4);
+        for (n, m) in every.iter().enumerate() {
+            assert!(
+                m.learn.iter().all(|l| l.sha256() != m.on_model.sha256()),
+                "{n}"
+            );
+            assert_eq!((m.learn.len(), &m.person), (2, &every[0].person));
+            assert!(
+                every[..n].iter().all(|before| before.name != m.name),
+                "{}",
+                m.name
+            );
+        }
+        assert_eq!(every[3].on_model.sha256(), last[0].on_model.sha256());
+        assert_eq!(every[3].learn[0].sha256(), last[0].learn[0].sha256());
     }
 }

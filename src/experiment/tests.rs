@@ -107,6 +107,32 @@ fn the_same_plan_gives_the_same_bytes_on_any_number_of_threads_in_parts_and_inte
     let refused = run(&args(&other, &at("once"), "1/1", 1)).unwrap_err();
     assert!(refused.to_string().contains("another plan"), "{refused}");
 
+    // Results that were cut, and courses, are no results.
+    let results = at("once").join(store::RESULTS);
+    let text = std::fs::read_to_string(&results).unwrap();
+    let cut = |text: &str| {
+        std::fs::write(&results, text).unwrap();
+        store::read(&at("once"))
+            .map(|_| ())
+            .unwrap_err()
+            .to_string()
+    };
+    let last = text.trim_end().rfind('\n').unwrap() + 1;
+    assert!(cut(&text[..last]).contains("is not there"));
+    assert!(cut(&[&text, &text[last..]].concat()).contains("there twice"));
+    assert!(cut(&text[..text.len() - 30]).contains("results.csv:"));
+    std::fs::write(&results, &text).unwrap();
+    let mut courses = std::fs::read_dir(at("once").join("series")).unwrap();
+    let course = courses.next().unwrap().unwrap().path();
+    let bytes_of = std::fs::read(&course).unwrap();
+    std::fs::write(&course, &bytes_of[..bytes_of.len() / 2]).unwrap();
+    let refused = store::read(&at("once"))
+        .map(|_| ())
+        .unwrap_err()
+        .to_string();
+    assert!(refused.contains("series"), "{refused}");
+    std::fs::write(&course, &bytes_of).unwrap();
+
     // What was run makes sense: the floor is lowest, holding is not best, and a link that stays away stops the arm.
     let (_, _, rows) = store::read(&at("once")).unwrap();
     let of = |method: &str, up: &str| {

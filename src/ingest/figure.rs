@@ -4,6 +4,7 @@ use std::path::Path;
 
 use telemime_operator::ingest::{Imported, Pose};
 
+use crate::cli::plural;
 use crate::figure::{BLACK, Figure, Layer, ORANGE, Panel, SKY, Shape, VERMILLION};
 
 /// More recordings than this are not drawn: nobody would look.
@@ -19,18 +20,13 @@ pub(super) fn figure(recordings: &[(&Path, &Imported)]) -> Figure {
     Figure {
         title: "Demonstrations in raw recordings".into(),
         note: format!(
-            "{takes} demonstration{} from {} recording{}{beyond}",
-            plural(takes),
-            recordings.len(),
-            plural(recordings.len())
+            "{} from {}{beyond}",
+            plural(takes, "demonstration", "demonstrations"),
+            plural(recordings.len(), "recording", "recordings")
         ),
         columns: if shown.len() > 3 { 2 } else { 1 },
         panels: shown.iter().map(|(p, i)| panel(p, i)).collect(),
     }
-}
-
-fn plural(n: usize) -> &'static str {
-    if n == 1 { "" } else { "s" }
 }
 
 fn panel(raw: &Path, imported: &Imported) -> Panel {

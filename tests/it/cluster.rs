@@ -16,11 +16,10 @@ link = \"delay 50ms 5ms loss 1%\"
 /// Of the forty that the document has.
 const SHARDS: u32 = 3;
 
-/// The block of `text` that begins with `first`, without its indent.
+/// The fenced block of `text` that begins with `first`.
 fn block(text: &str, first: &str) -> String {
-    let lines = text.lines().skip_while(|line| line.trim() != first);
-    let of = lines.take_while(|line| line.is_empty() || line.starts_with("    "));
-    let of: Vec<_> = of.map(|line| line.get(4..).unwrap_or("")).collect();
+    let lines = text.lines().skip_while(|line| *line != first);
+    let of: Vec<_> = lines.take_while(|line| *line != "```").collect();
     assert!(!of.is_empty(), "no block that begins with {first}");
     of.join("\n")
 }
@@ -97,7 +96,7 @@ fn the_clusters_examples_give_what_one_machine_gives() {
     }
     let merge = text
         .lines()
-        .find(|l| l.starts_with("    telemime experiment merge /results"));
+        .find(|l| l.starts_with("telemime experiment merge /results"));
     sh(&here(merge.unwrap().trim()), dir, &[]);
     std::fs::rename(results.join("latency"), dir.join("of-the-job")).unwrap();
     same(dir, "of-the-job");

@@ -84,7 +84,7 @@ fn values() -> BTreeMap<&'static str, [&'static str; 3]> {
         ("scale", ["0.1", "0.2", "0.3"]),
         ("axes", ["\"kinect\"", "base", "kinect"]),
         ("gain", ["0.1", "0.2", "0.3"]),
-        ("future_bound", ["\"10mm\"", "20mm", "2sigma"]),
+        ("future_bound", ["\"10mm\"", "20mm", "0.4way"]),
         ("path_bound_m", ["0.01", "0.02", "0.03"]),
         ("path_turn_bound_rad", ["0.01", "0.02", "0.03"]),
         ("max_silence_s", ["0.1", "0.15", "0.2"]),
@@ -211,6 +211,27 @@ fn what_the_environment_does_replaces_what_the_file_does() {
             .contains("did you mean TELEMIME_ROBOT_LISTEN?"),
         "{wrong}"
     );
+}
+
+/// The block of docs/commands.md is what is printed; `TELEMIME_WRITE_DOCS=1` writes it there.
+fn documented<D: Settings>() {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/commands.md");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let begin = format!("```toml {}\n", D::sheet().daemon);
+    let (before, rest) = text.split_once(&begin).unwrap();
+    let (block, after) = rest.split_once("```").unwrap();
+    let printed = example::<D>();
+    if std::env::var_os("TELEMIME_WRITE_DOCS").is_some() {
+        std::fs::write(&path, format!("{before}{begin}{printed}```{after}")).unwrap();
+    } else {
+        assert_eq!(block, printed, "TELEMIME_WRITE_DOCS=1 makes it so");
+    }
+}
+
+#[test]
+fn the_documented_configuration_is_the_printed_one() {
+    documented::<Robot>();
+    documented::<Operator>();
 }
 
 /// The example, and every line of it that sets something, taken one by one.

@@ -49,5 +49,6 @@ mod selection;
 mod soak;
 mod strangers;
 mod tap;
+mod units;
 mod versions;
 mod wrist;

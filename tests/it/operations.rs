@@ -8,7 +8,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use rustix::process::Signal;
+use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
 use crate::processes::{Process, Stage, alone};
@@ -193,38 +193,76 @@ fn robot(stage: &Stage, flags: &[&str], environment: &[(&str, &str)]) -> std::pr
         .unwrap()
 }
 
-#[test]
-fn a_supervisor_hears_of_ready_alive_and_stopping() {
-    let stage = Stage::new();
-    let path = stage.path("notify");
-    let socket = UnixDatagram::bind(&path).unwrap();
-    socket.set_read_timeout(Some(PATIENCE)).unwrap();
-    let environment = [
-        ("NOTIFY_SOCKET", path.to_str().unwrap()),
-        ("WATCHDOG_USEC", "200000"),
-    ];
-    let mut robot = robot(&stage, &[], &environment);
-    let hear = |wanted: &str| {
+/// A socket for what a daemon tells its supervisor, and the environment that names it.
+struct Supervisor {
+    socket: UnixDatagram,
+    path: String,
+}
+
+impl Supervisor {
+    fn new(stage: &Stage, name: &str) -> Self {
+        let path = stage.text(name);
+        let socket = UnixDatagram::bind(&path).unwrap();
+        socket.set_read_timeout(Some(PATIENCE)).unwrap();
+        Self { socket, path }
+    }
+
+    fn environment(&self) -> [(&str, &str); 2] {
+        [("NOTIFY_SOCKET", &self.path), ("WATCHDOG_USEC", "200000")]
+    }
+
+    /// The datagram with this line in it.
+    fn hears(&self, wanted: &str) -> String {
         let mut bytes = [0; 512];
         loop {
-            let n = socket.recv(&mut bytes).unwrap();
+            let n = self.socket.recv(&mut bytes).unwrap();
             let said = String::from_utf8_lossy(&bytes[..n]).into_owned();
             if said.lines().any(|line| line == wanted) {
                 return said;
             }
         }
-    };
-    let ready = hear("READY=1");
-    assert!(
-        ready.contains("STATUS=") && ready.contains("listens on 127.0.0.1:"),
-        "{ready}"
-    );
-    for _ in 0..3 {
-        hear("WATCHDOG=1");
     }
-    drop(robot.stdin.take());
-    hear("STOPPING=1");
+
+    fn hears_it_all(&self, status: &str, leave: impl FnOnce()) {
+        let ready = self.hears("READY=1");
+        assert!(
+            ready.contains("STATUS=") && ready.contains(status),
+            "{ready}"
+        );
+        for _ in 0..3 {
+            self.hears("WATCHDOG=1");
+        }
+        leave();
+        self.hears("STOPPING=1");
+    }
+}
+
+#[test]
+fn a_supervisor_hears_of_ready_alive_and_stopping() {
+    let stage = Stage::new();
+    let of_robot = Supervisor::new(&stage, "of-robot");
+    let mut robot = robot(&stage, &[], &of_robot.environment());
+    let input = robot.stdin.take();
+    of_robot.hears_it_all("listens on 127.0.0.1:", || drop(input));
     assert!(robot.wait().unwrap().success());
+
+    // An operator is ready when it dials, whether or not there is a robot.
+    let of_operator = Supervisor::new(&stage, "of-operator");
+    let key = stage.text("operator.key");
+    let peer = stage.fingerprint("robot");
+    let mut operator = Command::new(env!("CARGO_BIN_EXE_telemime"))
+        .args(["operator", "--connect", "127.0.0.1:1", "--peer", &peer])
+        .args(["--identity", &key, "--console", "127.0.0.1:0"])
+        .args(["--patience", "1000"])
+        .envs(of_operator.environment())
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap();
+    of_operator.hears_it_all("reaches for 127.0.0.1:1", || {
+        kill_process(Pid::from_child(&operator), Signal::TERM).unwrap();
+    });
+    assert!(operator.wait().unwrap().success());
 }
 
 #[test]

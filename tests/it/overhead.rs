@@ -136,7 +136,7 @@ fn a_live_hand_costs_less_than_its_samples() {
         "| hand, lease | messages/s | other packets up/s | knots/s | B a message | B/s of motion | B/s else, up | B/s down | B a knot, all included | of raw |"
     );
     let usual = drive(SessionConfig::default(), live);
-    usual.row("30 Hz, as it comes (1 σ, 650 ms)");
+    usual.row("30 Hz, as it comes (0.2 of the way, 650 ms)");
     let short = drive(config(0.1), live);
     short.row("30 Hz, 250 ms");
     let long = drive(config(0.3), live);

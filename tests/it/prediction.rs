@@ -292,16 +292,15 @@ fn report(set: &str, scores: &Scores) {
 /// The knots at which predictions are judged: 100, 200 and 300 ms.
 const JUDGED: [usize; 3] = [3, 6, 9];
 
-/// Ratios to hold at 100, 200 and 300 ms that the mixture must reach within 2 %, and those of what the session sends within
-/// 5 %; returns the latter. Fused, the same prediction may not be worse than the best that needs no model by more than 5 %,
-/// and its region of 90 % holds 80 to 99.5 %.
+/// Ratios to hold at 100, 200 and 300 ms that the mixture and what the session sends must reach within 2 %; returns the
+/// latter. Fused, the same prediction may not be worse than the best that needs no model by more than 5 %, and its region of 90 % holds 80 to 99.5 %.
 fn must_reach(set: &str, scores: &Scores, mixture: [f64; 3], fused: [f64; 3]) -> [f64; 3] {
     report(set, scores);
-    for (name, bar, slack) in [("gmr", mixture, 1.02), ("fused", fused, 1.05)] {
+    for (name, bar) in [("gmr", mixture), ("fused", fused)] {
         for (knot, bar) in JUDGED.into_iter().zip(bar) {
             let ratio = scores.ratio(name, knot);
             assert!(
-                ratio < slack * bar,
+                ratio < 1.02 * bar,
                 "{set}, {name}, knot {knot}: {ratio:.3} against {bar}"
             );
         }
@@ -345,23 +344,23 @@ fn gestures_are_predicted_better_than_by_the_prototype() {
 const GESTURES: [(&str, [[f64; 3]; 2]); 5] = [
     (
         "utd_mhad/a03_wave",
-        [[0.388, 0.360, 0.348], [0.417, 0.397, 0.392]],
+        [[0.388, 0.360, 0.348], [0.389, 0.358, 0.347]],
     ),
     (
         "utd_mhad/a01_swipe_left",
-        [[0.380, 0.322, 0.284], [0.406, 0.355, 0.321]],
+        [[0.380, 0.322, 0.284], [0.378, 0.329, 0.289]],
     ),
     (
         "utd_mhad/a09_circle_cw",
-        [[0.322, 0.307, 0.288], [0.345, 0.343, 0.332]],
+        [[0.322, 0.307, 0.288], [0.317, 0.309, 0.289]],
     ),
     (
         "utd_mhad/a15_tennis_swing",
-        [[0.415, 0.388, 0.370], [0.442, 0.422, 0.392]],
+        [[0.415, 0.388, 0.370], [0.411, 0.387, 0.367]],
     ),
     (
         "kard/a01_horizontal_arm_wave",
-        [[0.508, 0.485, 0.507], [0.514, 0.518, 0.554]],
+        [[0.508, 0.485, 0.507], [0.496, 0.483, 0.510]],
     ),
 ];
 
@@ -394,7 +393,7 @@ fn a_smooth_task_is_recognised_and_its_mixture_beats_the_straight_line() {
         return;
     };
     let scores = evaluate(&by_person(&folder), 3, false);
-    must_reach(set, &scores, [0.065, 0.087, 0.108], [0.067, 0.096, 0.122]);
+    must_reach(set, &scores, [0.065, 0.087, 0.108], [0.060, 0.080, 0.100]);
     for knot in JUDGED {
         assert!(scores.ratio("gmr", knot) < scores.ratio("cv", knot));
     }

@@ -529,3 +529,22 @@ fn the_demo_gives_one_json_object_and_its_figures() {
         assert!(out.join(figure).exists(), "{figure}");
     }
 }
+
+#[test]
+fn an_interrupted_demo_says_once_why_it_ended() {
+    let _alone = alone();
+    let stage = Stage::new();
+    let (out, demos) = (stage.text("out"), stage.text("swing"));
+    let demo = Process::start(&["demo", "--demos", &demos, "--out", &out]);
+    // It is saved when both daemons run, and before the recording has been driven.
+    let begun = std::time::Instant::now();
+    while !stage.path("out/skills/swing.skill").exists() {
+        assert!(begun.elapsed() < PATIENCE, "nothing was learned");
+        std::thread::yield_now();
+    }
+    demo.signal(Signal::INT);
+    let (status, said) = demo.end();
+    assert_eq!(status.code(), Some(1), "{said}");
+    let why: Vec<_> = said.lines().filter(|l| l.starts_with("telemime")).collect();
+    assert_eq!(why, ["telemime: stopped by hand"], "{said}");
+}

@@ -1,10 +1,15 @@
 //! An input's latency from taps: known latencies are found, and what says nothing is refused.
 
-use std::process::Command;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::process::{Command, Stdio};
 
 use nalgebra::Vector3;
+use telemime_operator::demonstration::{Demonstration, Sample};
 use telemime_operator::tap::{TapError, latency, stops};
 use telemime_sim::hand::{swing, taps};
+
+use crate::data::skipped;
+use crate::processes::alone;
 
 type Samples = Vec<(f64, Vector3<f64>)>;
 
@@ -176,4 +181,85 @@ fn the_command_reads_files_of_any_clock() {
     assert!(said.contains("line 14") && said.contains("soon"), "{said}");
     let output = run(&folder.path().join("none"));
     assert_eq!(output.status.code(), Some(1));
+}
+
+/// A synthetic tracker that sends at true speed, and a person who presses Enter on a terminal when the finger touches: both as a user has them, but
+/// that the person is never late, and sees the hand 0.1 s before the tracker tells it.
+#[test]
+fn live_from_what_a_tracker_sends_and_enter_on_a_terminal() {
+    const EARLY_S: f64 = 0.1;
+    let there_is = |program: &str| {
+        let found = Command::new(program).arg("--version").output();
+        found.is_ok_and(|out| out.status.success())
+    };
+    if !there_is("script") || !there_is("mkfifo") {
+        skipped("there is no `script` to make a terminal");
+        return;
+    }
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let (samples, touched) = taps(2, 6);
+    let recording: Vec<_> = samples
+        .into_iter()
+        .map(|(t_s, x)| Sample::at(t_s, x.into()))
+        .collect();
+    let csv = Demonstration::from_samples(path("taps.csv"), &recording).unwrap();
+    std::fs::write(path("taps.csv"), csv.to_csv()).unwrap();
+    let made = Command::new("mkfifo")
+        .arg(path("samples"))
+        .status()
+        .unwrap();
+    assert!(made.success());
+
+    // `script` gives its command a terminal, and types there what comes on its own standard input.
+    let command = "exec \"$PROGRAM\" tap - --live --count 6 --json < samples > found.json";
+    let mut terminal = Command::new("script")
+        .args(["--quiet", "--return", "--command", command, "/dev/null"])
+        .current_dir(folder.path())
+        .env("PROGRAM", env!("CARGO_BIN_EXE_telemime"))
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut sender = Command::new(env!("CARGO_BIN_EXE_telemime"))
+        .args(["send", "taps.csv", "--rest", "0"])
+        .current_dir(folder.path())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut tracker = std::fs::File::create(path("samples")).unwrap();
+    let mut keys = terminal.stdin.take().unwrap();
+    let mut presses = touched.iter().peekable();
+    let mut said = String::new();
+    for line in BufReader::new(sender.stdout.take().unwrap()).lines() {
+        let line = line.unwrap();
+        let frame: serde_json::Value = serde_json::from_str(&line).unwrap();
+        while presses
+            .next_if(|at| frame["t"].as_f64().unwrap() + EARLY_S >= **at)
+            .is_some()
+        {
+            keys.write_all(b"\n").unwrap();
+        }
+        // It ends by itself a second after the last press.
+        if writeln!(tracker, "{line}").is_err() {
+            break;
+        }
+    }
+    drop(tracker);
+    let mut screen = terminal.stdout.take().unwrap();
+    screen.read_to_string(&mut said).unwrap();
+    drop(keys);
+    let status = terminal.wait().unwrap();
+    let _ = sender.kill();
+    sender.wait().unwrap();
+    assert!(status.success(), "{status}: {said}");
+    assert!(said.contains("6 of 6"), "{said}");
+    let text = std::fs::read_to_string(path("found.json")).unwrap();
+    let found: serde_json::Value = serde_json::from_str(&text).unwrap();
+    // The press comes with a sample, half of their distance late on average.
+    let expected_ms = 1e3 * (EARLY_S - 0.5 / 30.0);
+    let off_ms = found["latency_ms"].as_f64().unwrap() - expected_ms;
+    println!("{found}");
+    assert!(off_ms.abs() < 40.0, "{found}");
 }

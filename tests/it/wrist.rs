@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, OnceLock};
 
-use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use nalgebra::{Quaternion, UnitQuaternion, Vector3, Vector4};
 use telemime::ground::{Pair, run_virtual};
 use telemime::measure::{Hand, Track, Turns, follow, sample_and_hold};
 use telemime_operator::cli::{Bounds, infer};
@@ -10,11 +10,14 @@ use telemime_operator::demonstration::{Demonstration, Sample};
 use telemime_operator::learn::{LearnOptions, learn_skill};
 use telemime_operator::session::SessionConfig;
 use telemime_operator::task::{Outcome, Recording, Task};
+use telemime_protocol::pose;
 use telemime_protocol::skill::Skill;
+use telemime_protocol::spline::HermiteSpan;
 use telemime_protocol::wire::v1::RobotState;
+use telemime_robot::daemon::Notice;
 use telemime_robot::servo::{RAMP_S, Report};
 use telemime_sim::hand::swing_with_wrist;
-use telemime_sim::link::Link;
+use telemime_sim::link::{Link, LinkConfig, Loss};
 
 use crate::scene::{REST_S, finish, rig, shaped};
 
@@ -132,6 +135,79 @@ fn a_turning_hand_is_mirrored_ahead_of_its_link() {
     };
     assert!((opening(0.5 * end_s) - 0.1).abs() < 0.01);
     assert!((opening(end_s) - 0.9).abs() < 0.01);
+}
+
+/// Over a link that loses a fifth of all messages and delays the rest unevenly.
+#[test]
+fn the_robot_holds_the_path_within_both_bounds() {
+    let (samples, skill) = (performance(5), skill());
+    let link = LinkConfig {
+        loss: Loss::random(0.2),
+        ..shaped()
+    };
+    let (bound_m, bound_rad) = (0.01, 0.02);
+    let config = SessionConfig {
+        path_bound_m: Some(bound_m),
+        path_turn_bound_rad: bound_rad,
+        ..SessionConfig::default()
+    };
+    let recording = Recording {
+        samples: samples.clone(),
+        rest_s: REST_S,
+    };
+    let (path, zero_s) = run_virtual(async {
+        let mut pair = Pair::start(&rig()).unwrap();
+        let task = Task::replay(recording);
+        let operator = pair.operator(task, Some(skill), config, &link, 7).unwrap();
+        let (summary, task, _) = finish(operator).await;
+        assert_eq!(summary.unwrap().outcome, Outcome::Completed);
+        pair.run_for(0.5).await;
+        let path = pair.robot.notices().iter().find_map(|n| match n {
+            Notice::Path(path) => Some(path.clone()),
+            _ => None,
+        });
+        (path.unwrap(), task.zero().unwrap().as_secs_f64())
+    })
+    .unwrap();
+    let (mut worst_m, mut worst_rad, mut covered) = (0.0f64, 0.0f64, 0);
+    // Knots lie on ticks of 10 µs. What it does not hold of the end when the session ends is not promised.
+    let frontier_s = path[path.len() - 1].0 + 1e-5;
+    for sample in &samples {
+        let t_s = sample.t_s + zero_s;
+        if t_s > frontier_s {
+            continue;
+        }
+        covered += 1;
+        let after = path.partition_point(|k| k.0 <= t_s).min(path.len() - 1);
+        let [a, b] = &path[after - 1..][..2] else {
+            panic!("{t_s} s lies outside");
+        };
+        assert!(!b.3, "no hole");
+        let (h, into_s) = (b.0 - a.0, (t_s - a.0).min(b.0 - a.0));
+        let ends = [a, b].map(|k| [k.1, k.2].map(Vector3::from));
+        let place = HermiteSpan::<3>::new(h, ends[0], ends[1]).unwrap();
+        worst_m = worst_m.max((place.position(into_s).unwrap() - sample.position).norm());
+        let ends = [a, b].map(|k| k.4.expect("an orientation").map(Vector4::from));
+        let turn = HermiteSpan::<4>::new(h, ends[0], ends[1]).unwrap();
+        let turn = pose::nearest(&turn.position(into_s).unwrap()).unwrap();
+        worst_rad = worst_rad.max(turn.angle_to(&sample.orientation.unwrap()));
+    }
+    assert!(
+        covered + 8 > samples.len(),
+        "{covered} of {} samples",
+        samples.len()
+    );
+    println!(
+        "{covered} samples, {} knots, worst {worst_m} m, {worst_rad} rad",
+        path.len()
+    );
+    // Stamps are rounded to 10 µs: at 10 m/s and 10 rad/s that is another 0.1 mm and mrad.
+    assert!(worst_m <= bound_m + 1e-4, "{worst_m} m");
+    assert!(worst_rad <= bound_rad + 1e-4, "{worst_rad} rad");
+    assert!(
+        worst_rad > 0.1 * bound_rad,
+        "it is a curve: {worst_rad} rad"
+    );
 }
 
 #[test]

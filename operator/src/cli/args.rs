@@ -13,7 +13,7 @@ use telemime_endpoint::{cli, logs};
 use super::input::InputArgs;
 use crate::console::Shape;
 use crate::placed::Placed;
-use crate::session::{FutureBound, SessionConfig};
+use crate::session::{FutureBound, MAX_LEASE_S, MAX_SILENCE_S, SessionConfig};
 
 /// Teach, drive and play a robot.
 ///
@@ -119,8 +119,9 @@ pub struct Args {
     /// Prediction gain, 0 (none) to 1.
     #[arg(long)]
     pub gain: Option<f64>,
-    /// ε_future: when the robot's prediction would be off by more, the operator speaks; a length (40mm, 0.04m) or a
-    /// multiple of the predicted deviation (0.6sigma) [default: 1sigma].
+    /// ε_future: when the robot's prediction would be off by more, the operator speaks; a share of the way the hand
+    /// usually goes until a message takes effect (0.2way), a length (40mm, 0.04m) or a multiple of the predicted deviation
+    /// (0.6sigma) [default: 0.2way].
     #[arg(long, value_name = "BOUND", value_parser = parse_future_bound)]
     pub future_bound: Option<FutureBound>,
     /// ε_path, m: the robot's record of the path is that exact [default: 2 % of the skill's reach].
@@ -228,15 +229,11 @@ impl Axes {
     }
 }
 
-/// Longest silence that still lets the arm follow at full speed: the robot coasts after 0.26 s.
-const MAX_SILENCE_S: f64 = 0.25;
-
-/// Longest lease the robot grants, s.
-const MAX_LEASE_S: f64 = 1.0;
-
 pub(super) fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
     let wrong = || {
-        format!("`{text}`: write a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)")
+        format!(
+            "`{text}`: write a share of the way (0.2way), a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)"
+        )
     };
     let number = |digits: &str| {
         digits
@@ -248,6 +245,8 @@ pub(super) fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
     };
     if let Some(digits) = text.strip_suffix("sigma") {
         Ok(FutureBound::Relative(number(digits)?))
+    } else if let Some(digits) = text.strip_suffix("way") {
+        Ok(FutureBound::Share(number(digits)?))
     } else if let Some(digits) = text.strip_suffix("mm") {
         Ok(FutureBound::Absolute(number(digits)? * 1e-3))
     } else if let Some(digits) = text.strip_suffix('m') {
@@ -316,6 +315,12 @@ impl Args {
         )?;
         within("--hand-sigma", config.hand_sigma_m, 0.0, 1.0)?;
         within("--gain", config.gain, -f64::EPSILON, 1.0)?;
+        if let Some(rest_s) = self.rest {
+            within("--rest", rest_s, -f64::EPSILON, 60.0)?;
+        }
+        if let Some(patience_s) = self.patience {
+            within("--patience", patience_s, 0.0, 3600.0)?;
+        }
         if let Some(scale) = config.scale {
             within("--scale", scale, 0.0, 10.0)?;
         }
@@ -350,7 +355,8 @@ mod tests {
             parse_future_bound("0.6sigma"),
             Ok(FutureBound::Relative(0.6))
         );
-        for bad in ["", "40", "mm", "-1mm", "nanmm", "infsigma"] {
+        assert_eq!(parse_future_bound("0.2 way"), Ok(FutureBound::Share(0.2)));
+        for bad in ["", "40", "mm", "-1mm", "nanmm", "infsigma", "way", "-1way"] {
             assert!(parse_future_bound(bad).is_err(), "{bad}");
         }
     }

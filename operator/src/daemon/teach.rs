@@ -9,7 +9,7 @@ use tokio::sync::mpsc;
 use super::Daemon;
 use super::said::Notice;
 use crate::console::Act;
-use crate::lessons::{Lesson, LessonError, Lessons};
+use crate::lessons::{Lesson, LessonError, Lessons, News};
 use crate::session::Session;
 use crate::task::Task;
 
@@ -26,6 +26,13 @@ impl Daemon {
         match act {
             Act::Stop => session.stop(self.now()),
             Act::Shape(shape) => drop(notices.send(Notice::LinkAsked(shape))),
+            // What is being learned on the terminal's word is of the skill in use, and would take its place again.
+            Act::Use(_) if lessons.is_busy() => {
+                let used = lessons.skill().map(|skill| skill.name().to_owned());
+                if let Some(live) = task.person() {
+                    live.on_not_used(used);
+                }
+            }
             Act::Use(skill) => {
                 lessons.adopt(Arc::clone(&skill));
                 session.replace_skill(skill);
@@ -59,7 +66,6 @@ impl Daemon {
             Word::Refine => lessons.refine()?,
             Word::Save(file) => {
                 lessons.save(file)?;
-                let _ = notices.send(Notice::Saved(file.clone()));
             }
             Word::Stop | Word::Reset | Word::Engage | Word::Release => {}
             Word::BlackBox | Word::Pair(_) | Word::Yes | Word::No => {}
@@ -67,11 +73,32 @@ impl Daemon {
         Ok(())
     }
 
-    /// Tells what was learned, saves it if that is wanted, and returns the skill if it is a new one.
-    pub(super) fn learned(
+    /// Tells what was learned or written, and returns the skill if it is a new one.
+    pub(super) fn news(
+        &self,
+        news: News,
+        lessons: &mut Lessons,
+        task: &mut Task,
+        notices: &mpsc::UnboundedSender<Notice>,
+    ) -> Option<Arc<Skill>> {
+        match news {
+            News::Learned(lesson) => self.learned(*lesson, lessons, task, notices),
+            News::Saved(Ok(file)) => {
+                let _ = notices.send(Notice::Saved(file));
+                None
+            }
+            News::Saved(Err(e)) => {
+                let _ = notices.send(Notice::Note(e.to_string().into()));
+                None
+            }
+        }
+    }
+
+    /// Tells what was learned, has it saved if that is wanted, and returns the skill if it is a new one.
+    fn learned(
         &self,
         lesson: Result<Lesson, LessonError>,
-        lessons: &Lessons,
+        lessons: &mut Lessons,
         task: &mut Task,
         notices: &mpsc::UnboundedSender<Notice>,
     ) -> Option<Arc<Skill>> {
@@ -102,12 +129,10 @@ impl Daemon {
             skill: Arc::clone(&skill),
             learned: learned.collect(),
         });
-        let folder = self.learning.save.as_deref();
-        if let Some(file) = folder.and_then(|folder| lessons.file_in(folder)) {
-            match lessons.save(&file) {
-                Ok(()) => drop(notices.send(Notice::Saved(file))),
-                Err(e) => note(e.to_string()),
-            }
+        if let Some(folder) = self.learning.save.as_deref()
+            && let Err(e) = lessons.save_in(folder)
+        {
+            note(e.to_string());
         }
         Some(skill)
     }

@@ -4,7 +4,7 @@
 //!
 //! Every sample is the truth about what was predicted for it. The weights follow the errors seen lately, in relation to how
 //! far the hand moved, beside what the skill's calibration expects of each expert. Three things decide how much that
-//! expectation counts: the motion must be familiar, the mixture as good as it promised, and the hand in motion. *A resting
+//! expectation counts: the motion must be familiar, no smoother than what was learned, and the hand in motion. *A resting
 //! hand says nothing about the mixture*: at rest everything is right, and a skill knows that motion will begin but not when.
 
 use std::collections::VecDeque;
@@ -12,8 +12,8 @@ use std::collections::VecDeque;
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 use telemime_protocol::pose;
 use telemime_protocol::predict::{
-    Ahead, BAND_KNOTS, Calibration, Experts, Forecast, HandState, KNOT_SPACING_S, Model, Params,
-    TurnForecast, TurnModel, TurnState, WEIGHTED,
+    Ahead, BAND_KNOTS, Calibration, Experts, Forecast, HandState, KNOT_SPACING_S, MAX_KNOTS, Model,
+    Params, TurnForecast, TurnModel, TurnState, WEIGHTED,
 };
 use telemime_protocol::time::Stamp;
 
@@ -23,32 +23,40 @@ const FRAME_S: f64 = 1.0 / 30.0;
 /// A gap in the samples counts as at most this many frames.
 const LONGEST_FRAMES: f64 = 3.0;
 
-/// What an error made a frame ago still counts.
-const MEMORY: f64 = 0.93;
+/// What an error made a frame ago still counts: a second ago, two fifths.
+const MEMORY: f64 = 0.97;
 
-/// The calibration weighs as much as this many frames, as long as the motion is familiar.
-const PRIOR: f64 = 15.0;
+/// The calibration weighs as much as this many frames, as long as the motion is familiar: one gesture has few independent errors,
+/// and a prediction that is on its model at all is on it at every horizon.
+const PRIOR: f64 = 100.0;
 
-/// Where it is not, the experts are taken as alike at the first horizon, by this many frames …
+/// What the mixture errs by (squared) of what was calibrated: the calibration had to learn without a demonstration.
+const WHOLE: f64 = 0.65;
+
+/// Straight line and generic extrapolator are as calibrated until as many frames say otherwise.
+const ORDINARY: f64 = 1.0;
+
+/// Where they err less than calibrated, the motion is smoother than what was learned, and the calibration counts less by this
+/// power of how much less.
+const ORDINARY_POWER: i32 = 2;
+
+/// Where the motion is not familiar, the experts are taken as alike at the first horizon, by this many frames …
 const UNKNOWN: f64 = 0.3;
 
 /// … and farther ahead as what is known nearer leads to expect, by this many,
 const CASCADE: f64 = 5.0;
 
 /// errors (squared, against holding) having grown by this factor.
-const GROWTH: [f64; BAND_KNOTS.len() - 1] = [3.0, 4.0];
+const GROWTH: [f64; BAND_KNOTS.len() - 1] = [1.5, 4.0];
 
 /// Weights fall with this power of the mean squared errors.
 const POWER: i32 = 3;
 
 /// What a familiar state a frame ago still counts.
-const FAMILIAR_MEMORY: f64 = 0.9;
+const FAMILIAR_MEMORY: f64 = 0.6;
 
 /// Less than familiar is unfamiliar: the power of the running mean.
 const FAMILIAR_POWER: i32 = 8;
-
-/// A mixture that errs (squared) this many times as much as calibrated is not on its model.
-const SURPRISE: f64 = 32.0;
 
 /// Errors below this are right, m and rad.
 const RIGHT: f64 = 1e-4;
@@ -58,16 +66,17 @@ const VERDICT_POWER: i32 = 4;
 
 /// A hand that has been seen to rest for this long is taken as resting by half, s. What is demonstrated begins sooner after its
 /// recording does (on gestures after 0.07 to 0.3 s), and at the first sample nothing is known of before.
-const REST_S: f64 = 0.35;
+const REST_S: f64 = 0.45;
 
-/// How sharply that turns: 2 % of the trust are left after a second, 0.1 % after two.
-const REST_POWER: i32 = 4;
+/// How sharply that turns: 96 % of the trust are left after 0.3 s, 0.2 % after a second.
+const REST_POWER: i32 = 8;
 
-/// A hand that has moved less than this share of the skill's reach lately is at rest.
-const REST: f64 = 0.02;
+/// A hand that has moved less than this share of the skill's reach lately is at rest: at twice of it 6 % at rest, at half of it 94 %,
+/// so that what a tracker errs by begins nothing and a motion that has begun is soon believed.
+const REST: f64 = 0.01;
 
 /// A hand that turns less than this lately is at rest, rad.
-const REST_RAD: f64 = 0.02;
+const REST_RAD: f64 = 0.01;
 
 /// The region that is to hold `1 − MISSED` of what happens: 90 % quantile of χ² with three degrees of freedom.
 const REGION: f64 = 6.251;
@@ -201,8 +210,10 @@ impl Record {
 pub struct Adaptation<C: Course> {
     gain: f64,
     rest: f64,
-    /// Mean squared errors at each horizon that the calibration expects, in all axes; none without a model.
-    expected: Option<[[f64; WEIGHTED + 1]; BAND_KNOTS.len()]>,
+    /// Mean squared errors at each knot that the calibration expects, in all axes; none without a model.
+    calibrated: Option<[[f64; WEIGHTED + 1]; MAX_KNOTS]>,
+    /// Where the experts are judged for each band's weights.
+    judged: [usize; BAND_KNOTS.len()],
     /// There was a model to predict the newest sample's future with.
     learned: bool,
     records: [Record; BAND_KNOTS.len()],
@@ -237,11 +248,16 @@ impl<C: Course> Adaptation<C> {
     }
 
     fn new(gain: f64, start: Option<&Calibration>, rest: f64) -> Self {
-        let at = |c: &Calibration| BAND_KNOTS.map(|knot| c.errors[knot - 1].map(|v| 3.0 * v));
+        let at = |c: &Calibration| {
+            c.errors.map(|[mixture, generic, straight, hold]| {
+                [WHOLE * mixture, generic, straight, hold].map(|v| 3.0 * v)
+            })
+        };
         Self {
             gain: gain.clamp(0.0, 1.0),
             rest,
-            expected: start.map(at),
+            calibrated: start.map(at),
+            judged: BAND_KNOTS,
             learned: start.is_some(),
             records: [Record::default(); BAND_KNOTS.len()],
             familiar: None,
@@ -257,6 +273,24 @@ impl<C: Course> Adaptation<C> {
     pub fn seen(self, hand: &C, seen_s: f64) -> Self {
         let rested_s = seen_s * (1.0 - self.moving(hand));
         Self { rested_s, ..self }
+    }
+
+    /// What is sent will be used up to about `horizon_s` ahead. Beyond the last of [`BAND_KNOTS`] its weights hold, and are found there.
+    pub fn used_at(&mut self, horizon_s: f64) {
+        let knot = (horizon_s / KNOT_SPACING_S).round() as usize;
+        let [.., last] = &mut self.judged;
+        let [.., least] = BAND_KNOTS;
+        let knot = knot.clamp(least, MAX_KNOTS);
+        // A delay that trembles is no other horizon.
+        if knot.abs_diff(*last) > 1 {
+            *last = knot;
+            self.records[BAND_KNOTS.len() - 1] = Record::default();
+        }
+    }
+
+    /// Mean squared errors that the calibration expects where this band is judged.
+    fn expected(&self, band: usize) -> Option<[f64; WEIGHTED + 1]> {
+        Some(self.calibrated.as_ref()?[self.judged[band] - 1])
     }
 
     /// The numbers that travel, for a prediction from `hand`.
@@ -298,7 +332,7 @@ impl<C: Course> Adaptation<C> {
         };
         let ahead = Ahead::fused(&experts, &params);
         let unfamiliar = 1.0 - experts.familiarity.powi(VERDICT_POWER);
-        let said = BAND_KNOTS.map(|knot| {
+        let said = self.judged.map(|knot| {
             let knot = knot.min(experts.count);
             let fused = &ahead.knots[knot];
             let [xx, xy, xz, yy, yz, zz] = fused.covariance;
@@ -352,25 +386,35 @@ impl<C: Course> Adaptation<C> {
 
     /// How much the calibration counts, from 0 to 1.
     fn credit(&self) -> f64 {
-        let Some(expected) = &self.expected else {
-            return 0.0;
+        match &self.calibrated {
+            Some(_) => self.familiar.unwrap_or(1.0).powi(FAMILIAR_POWER),
+            None => 0.0,
+        }
+    }
+
+    /// Frames that the calibration weighs as. What a skill learned from abrupt motion expects of each expert must not drown what
+    /// smooth motion shows.
+    fn prior(&self) -> f64 {
+        let (Some(expected), Some(moved)) = (self.expected(0), self.records[0].moved()) else {
+            return PRIOR;
         };
-        let familiar = self.familiar.unwrap_or(1.0).powi(FAMILIAR_POWER);
-        let [mixture, .., hold] = expected[0];
-        let record = &self.records[0];
-        let Some(moved) = record.moved() else {
-            return familiar;
-        };
-        let promised = mixture / hold * moved;
-        let surprise =
-            (record.squared[0] + PRIOR * promised) / ((record.frames + PRIOR) * promised);
-        let ratio = surprise / SURPRISE;
-        familiar / (1.0 + ratio * ratio)
+        let [.., hold] = expected;
+        let Record {
+            squared, frames, ..
+        } = &self.records[0];
+        let simple = 1..WEIGHTED;
+        let share = simple
+            .map(|e| {
+                let promised = expected[e] / hold * moved;
+                (squared[e] + ORDINARY * promised) / ((frames + ORDINARY) * promised)
+            })
+            .fold(1.0, f64::min);
+        PRIOR * share.powi(ORDINARY_POWER)
     }
 
     /// Weights ∝ (mean squared error)⁻³ at every horizon.
     fn weights(&self, hand: &C) -> [[f64; WEIGHTED]; BAND_KNOTS.len()] {
-        let credit = self.credit();
+        let (credit, prior) = (self.credit(), self.prior());
         let moving = self.moving(hand);
         let rested = (self.rested_s / REST_S).powi(REST_POWER);
         let moving = moving + (1.0 - moving) / (1.0 + rested);
@@ -381,19 +425,20 @@ impl<C: Course> Adaptation<C> {
             let unknown = match nearer {
                 None => [UNKNOWN; WEIGHTED + 1],
                 Some(errors) => {
-                    let grown = |e: f64| (e * GROWTH[band - 1]).min(1e4);
+                    let farther = self.judged[band] as f64 / BAND_KNOTS[band] as f64;
+                    let grown = |e: f64| (e * GROWTH[band - 1] * farther).min(1e4);
                     let [mixture, generic, straight, hold] = errors;
                     [grown(mixture), grown(generic), grown(straight), hold].map(|e| CASCADE * e)
                 }
             };
-            let expected = self.expected.map(|expected| expected[band]);
+            let expected = self.expected(band);
             let hold = expected.map_or(1.0, |e| e[WEIGHTED]);
             let moved = record.moved().unwrap_or(hold);
-            let right = RIGHT * RIGHT * (record.frames + PRIOR);
+            let right = RIGHT * RIGHT * (record.frames + prior);
             let errors: [f64; WEIGHTED + 1] = std::array::from_fn(|e| {
-                let calibrated = expected.map_or(0.0, |expected| PRIOR * expected[e] / hold);
-                let prior = credit * calibrated + (1.0 - credit) * unknown[e];
-                record.squared[e] + prior * moved + right
+                let calibrated = expected.map_or(0.0, |expected| prior * expected[e] / hold);
+                let before = credit * calibrated + (1.0 - credit) * unknown[e];
+                record.squared[e] + before * moved + right
             });
             nearer = Some(errors.map(|e| e / errors[WEIGHTED]));
             // Without a model there are two experts.
@@ -429,6 +474,7 @@ impl<C: Course> Adaptation<C> {
             .iter()
             .map(Vector3::norm_squared)
             .fold(0.0, f64::max);
-        moved / (moved + self.rest * self.rest)
+        let (moved, rest) = (moved * moved, self.rest.powi(4));
+        moved / (moved + rest)
     }
 }

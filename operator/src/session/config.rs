@@ -13,7 +13,17 @@ pub enum FutureBound {
     Absolute(f64),
     /// A multiple of the predicted standard deviation.
     Relative(f64),
+    /// A share of the way the hand usually goes from a sample until its message takes effect, as the skill's
+    /// demonstrations have it (root mean square), but at most two predicted deviations; without a skill half a metre a second
+    /// along each axis is taken for usual.
+    Share(f64),
 }
+
+/// Longest silence that still lets the arm follow at full speed, s: the robot coasts after 0.26 s.
+pub const MAX_SILENCE_S: f64 = 0.25;
+
+/// Longest lease the robot grants, s.
+pub const MAX_LEASE_S: f64 = 1.0;
 
 /// What a session is set to.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,7 +63,7 @@ impl Default for SessionConfig {
             max_silence_s: 0.2,
             min_interval_s: 0.01,
             lease_s: 0.65,
-            future_bound: FutureBound::Relative(1.0),
+            future_bound: FutureBound::Share(0.2),
             path_bound_m: None,
             path_turn_bound_rad: 0.05,
             input_latency_s: 0.0,

@@ -129,12 +129,21 @@ impl Sent {
     }
 }
 
+/// How far off the robot may be.
+#[derive(Debug, Clone, Copy)]
+enum CorrectionBound {
+    /// m.
+    Distance(f64),
+    /// Of what is left open once skill and hand have had their say.
+    Deviations(f64),
+}
+
 /// The corrections of one play.
 pub(super) struct Correction {
     curve: PoseCurve,
     leeway: Leeway,
     hand_sigma_m: f64,
-    bound: FutureBound,
+    bound: CorrectionBound,
     /// Prediction gain κ.
     gain: f64,
     /// The plan's time and rate at this moment at the arm; `None` until the robot has engaged.
@@ -153,8 +162,10 @@ impl Correction {
             leeway,
             hand_sigma_m: config.hand_sigma_m,
             bound: match config.future_bound {
-                FutureBound::Relative(k) => FutureBound::Relative(FINER * k),
-                absolute => absolute,
+                FutureBound::Absolute(m) => CorrectionBound::Distance(m),
+                FutureBound::Relative(k) => CorrectionBound::Deviations(FINER * k),
+                // Nobody has demonstrated how far corrections go.
+                FutureBound::Share(_) => CorrectionBound::Deviations(FINER),
             },
             gain: config.gain,
             clock: None,
@@ -273,8 +284,8 @@ impl Correction {
         let meant = self.curve.position_at(bend.plan_at(ahead.secs_since(now)))
             + bend.offset_at(ahead.secs_since(now), since_sample_s);
         let bound_m = match self.bound {
-            FutureBound::Absolute(m) => m,
-            FutureBound::Relative(k) => k * self.fusion(now).deviation_m,
+            CorrectionBound::Distance(m) => m,
+            CorrectionBound::Deviations(k) => k * self.fusion(now).deviation_m,
         };
         // Written so that NaN speaks.
         !((told - meant).norm() <= bound_m)

@@ -58,6 +58,11 @@ impl Session {
                 hand_q,
                 tip_q,
             } => {
+                if engagement != self.engagement || !self.is_asking() {
+                    // Granted what nobody wants any more: it would go on to the end of its lease.
+                    self.control(&OperatorControl::Release { engagement });
+                    return Ok(());
+                }
                 self.before = None;
                 if let Some(correction) = self.correction() {
                     correction.begin(Stamp(t_us.saturating_mul(1000)));
@@ -79,6 +84,11 @@ impl Session {
                     // Something else was declined: what the robot follows is not left to its lease.
                     self.release();
                 } else {
+                    // It may be an earlier request that was declined; should this one be granted, nobody will be there for it.
+                    if self.is_asking() {
+                        let engagement = self.engagement;
+                        self.control(&OperatorControl::Release { engagement });
+                    }
                     self.end_activity();
                     // What was sent for nothing is not what following took.
                     if let Some(before) = self.before.take() {
@@ -169,6 +179,15 @@ impl Session {
                 self.model_stored = self.skill.is_some();
                 self.events.push_back(Event::Ready);
             }
+        }
+    }
+
+    /// Whether the newest request is for what is being done, granted or not.
+    fn is_asking(&self) -> bool {
+        match self.activity {
+            Activity::Mirror(_) => true,
+            Activity::Play { engaged, .. } => engaged,
+            Activity::Nothing => false,
         }
     }
 

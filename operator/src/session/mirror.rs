@@ -3,7 +3,7 @@
 use nalgebra::{UnitQuaternion, Vector3};
 use telemime_protocol::checkpoint::CheckpointError;
 use telemime_protocol::checkpoint::path::PathBounds;
-use telemime_protocol::predict::{Forecast, HandState, Params, TurnState, checksum};
+use telemime_protocol::predict::{Forecast, HandState, MAX_KNOTS, Params, TurnState, checksum};
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Drive, Motion, PathTail, model_tag};
@@ -12,6 +12,7 @@ use super::adapt::Adaptation;
 use super::gate::Taken;
 use super::hand::{Hand, Known, Travelling, rotation};
 use super::path::{Path, ShownKnot};
+use super::usual::Usual;
 use super::{FutureBound, HandSample};
 
 /// Every so many messages the robot's prediction is checked against ours.
@@ -23,8 +24,16 @@ const LEAST_FUTURE_BOUND_M: f64 = 1e-3;
 /// The same for orientations, rad.
 const LEAST_FUTURE_BOUND_RAD: f64 = 5e-3;
 
-/// Where the future's bound is a distance, an orientation may be off by this multiple of its deviation.
+/// Where the future's bound says nothing of orientations, they may be off by this multiple of their deviation.
 const TURN_SIGMAS: f64 = 0.6;
+
+/// A share of the way is never more than this multiple of the predicted deviation: where much better can be foretold, the robot is
+/// to have it.
+const EXACT_SIGMAS: f64 = 2.0;
+
+/// Most of how a hand that is led with care turns is the tracker's tremble: a share of that way is no finer than this multiple
+/// of what a prediction errs by anyway, or every sample would be news.
+const TREMBLE_SIGMAS: f64 = 1.5;
 
 /// A gripper is told of changes above this, in steps of 1/255.
 const GRIP_STEPS: u8 = 4;
@@ -48,6 +57,8 @@ pub(super) struct Mirror {
     path: Path,
     places: Adaptation<HandState>,
     turns: Adaptation<TurnState>,
+    /// How far the hand usually goes and, where that was learned, turns.
+    usual: (Usual, Option<Usual>),
     without_model: bool,
     newest: Option<Known>,
     sent: Option<Known>,
@@ -72,6 +83,15 @@ impl Mirror {
         )
         .seen(&hand.place, seen_s);
         let turning = skill.and_then(Skill::turn);
+        let usual = (
+            match skill.map(Skill::predictor) {
+                Some(model) => Usual::of(model.calibration(), model.knots()),
+                None => Usual::of(Usual::UNKNOWN, MAX_KNOTS),
+            },
+            turning
+                .map(|turn| turn.predictor.model())
+                .map(|model| Usual::of(model.calibration(), model.knots())),
+        );
         let turns = turning.map(|turn| turn.predictor.model().calibration());
         let turns = Adaptation::of_turns(gain, turns);
         let turns = match &hand.turn {
@@ -86,6 +106,7 @@ impl Mirror {
             path,
             places,
             turns,
+            usual,
             // The robot ends with the model it began with, so a model that arrives now is for the next engagement.
             without_model: skill.is_none(),
             newest: None,
@@ -132,6 +153,12 @@ impl Mirror {
     pub(super) fn set_gain(&mut self, gain: f64) {
         self.places.set_gain(gain);
         self.turns.set_gain(gain);
+    }
+
+    /// What is sent from now on is used up to about this far ahead, s.
+    pub(super) fn used_at(&mut self, horizon_s: f64) {
+        self.places.used_at(horizon_s);
+        self.turns.used_at(horizon_s);
     }
 
     /// By what the hand is predicted now, place and orientation.
@@ -232,9 +259,13 @@ impl Mirror {
             sent.place.at(ahead_s(sent.place.t)),
             newest.place.at(ahead_s(newest.place.t)),
         );
-        let (bound_m, sigmas) = match bound {
-            FutureBound::Absolute(bound_m) => (bound_m, TURN_SIGMAS),
-            FutureBound::Relative(factor) => (factor * known.sigma_m, factor),
+        let bound_m = match bound {
+            FutureBound::Absolute(bound_m) => bound_m,
+            FutureBound::Relative(sigmas) => sigmas * known.sigma_m,
+            FutureBound::Share(share) => {
+                let way_m = self.usual.0.in_s(ahead_s(newest.place.t));
+                (share * way_m).min(EXACT_SIGMAS * known.sigma_m)
+            }
         };
         if (held.position - known.position).norm() > bound_m.max(LEAST_FUTURE_BOUND_M) {
             return true;
@@ -242,8 +273,18 @@ impl Mirror {
         let turned = match (&sent.turn, &newest.turn) {
             (Some(sent), Some(newest)) => {
                 let (held, known) = (sent.at(ahead_s(sent.t)), newest.at(ahead_s(newest.t)));
-                let bound_rad = (sigmas * known.sigma_rad).max(LEAST_FUTURE_BOUND_RAD);
-                held.orientation.angle_to(&known.orientation) > bound_rad
+                let bound_rad = match (bound, &self.usual.1) {
+                    (FutureBound::Relative(sigmas), _) => sigmas * known.sigma_rad,
+                    (FutureBound::Share(share), Some(usual)) => {
+                        let way = share * usual.in_s(ahead_s(newest.t));
+                        way.max(TREMBLE_SIGMAS * known.sigma_rad)
+                    }
+                    (FutureBound::Absolute(_) | FutureBound::Share(_), _) => {
+                        TURN_SIGMAS * known.sigma_rad
+                    }
+                };
+                held.orientation.angle_to(&known.orientation)
+                    > bound_rad.max(LEAST_FUTURE_BOUND_RAD)
             }
             (sent, newest) => sent.is_some() != newest.is_some(),
         };

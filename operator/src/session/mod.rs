@@ -16,6 +16,7 @@ mod path;
 mod said;
 #[cfg(test)]
 mod tests;
+mod usual;
 mod view;
 
 use std::collections::VecDeque;
@@ -38,7 +39,9 @@ use telemime_protocol::wire::v1::{
 
 use crate::recognise::{Recogniser, Verdict};
 
-pub use config::{FutureBound, HandSample, SessionConfig, default_scale};
+pub use config::{
+    FutureBound, HandSample, MAX_LEASE_S, MAX_SILENCE_S, SessionConfig, default_scale,
+};
 pub use correct::{Bent, Change, LOST_S, Leeway};
 pub use path::ShownKnot;
 pub use said::{Counters, Event, Output, Seen};
@@ -306,6 +309,8 @@ impl Session {
             }
             self.counters.samples += 1;
         }
+        // Until the next message, on average: half a silence longer.
+        mirror.used_at(self.delay_s + lag_s + 0.5 * self.config.max_silence_s);
         self.counters.knots += mirror.take(&sample, taken, hand, skill);
         let backlog = mirror.backlog();
         let arrival = now.offset_by_secs(network_s + lag_s);
@@ -448,8 +453,9 @@ impl Session {
 
     /// Emergency stop: on the stream, and by datagram until the robot says it has stopped.
     pub fn stop(&mut self, now: Stamp) {
-        self.end_activity();
+        // Before a model that has waited for the end of what was driven: it may take seconds.
         self.control(&OperatorControl::EmergencyStop);
+        self.end_activity();
         self.next_stop = Some(now);
     }
 
@@ -545,6 +551,14 @@ impl Session {
             return;
         };
         let (id, bytes) = (skill.id().0, skill.to_bytes().to_vec());
+        if self
+            .skill
+            .as_ref()
+            .is_none_or(|last| last.name() != skill.name())
+        {
+            // A performance of another skill is nothing for this one to learn from.
+            self.driven.clear();
+        }
         self.skill = Some(skill);
         self.model_stored = false;
         // Before the robot has introduced itself nobody knows what it holds; then it is told.

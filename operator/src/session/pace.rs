@@ -153,6 +153,7 @@ impl Pace {
         match bound {
             FutureBound::Absolute(bound_m) => FutureBound::Absolute(factor * bound_m),
             FutureBound::Relative(sigmas) => FutureBound::Relative(factor * sigmas),
+            FutureBound::Share(share) => FutureBound::Share(factor * share),
         }
     }
 

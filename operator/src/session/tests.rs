@@ -20,6 +20,7 @@ mod mirroring;
 mod path;
 mod posing;
 mod resting;
+mod trusting;
 
 const MS: i64 = 1_000_000;
 const EPOCH: u32 = 17;

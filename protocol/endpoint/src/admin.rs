@@ -7,6 +7,7 @@ use serde::Serialize;
 use telemime_protocol::wire::pair::Name;
 
 use crate::cli::{config_dir, say};
+use crate::config::{self, CheckArgs, Settings};
 use crate::identity::{Fingerprint, Identity};
 use crate::peers::{Peer, Peers, Role};
 
@@ -32,6 +33,32 @@ pub fn own_name(given: Option<&str>) -> anyhow::Result<Name> {
         None => Ok(Name::made_of(
             &rustix::system::uname().nodename().to_string_lossy(),
         )),
+    }
+}
+
+/// What a daemon's own program does to its host, besides being the daemon.
+#[derive(Debug, Subcommand)]
+#[expect(
+    missing_docs,
+    reason = "a comment here would hide the help that these have"
+)]
+pub enum HostCommand {
+    Identity(IdentityArgs),
+    Peers(PeersArgs),
+    CheckConfig(CheckArgs),
+}
+
+impl HostCommand {
+    /// Does it on the host of the daemon `D`, which is this `role`; whether a configuration that was checked would be taken.
+    ///
+    /// # Errors
+    /// One line for a person.
+    pub fn run<D: Settings>(&self, role: Role) -> anyhow::Result<bool> {
+        match self {
+            Self::Identity(args) => identity(args, role).map(|()| true),
+            Self::Peers(args) => peers(args).map(|()| true),
+            Self::CheckConfig(args) => config::check::<D>(args, &config::environment()),
+        }
     }
 }
 

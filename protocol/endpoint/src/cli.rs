@@ -1,8 +1,9 @@
 //! What both daemons' command lines share.
 
-use std::io::{self, BufRead, IsTerminal, Write};
+use std::io::{self, BufRead, IsTerminal, Read, Write};
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::PathBuf;
+use std::process::ExitCode;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 use std::time::Duration;
@@ -24,6 +25,18 @@ pub fn config_dir() -> PathBuf {
         .or_else(|| set("HOME").map(|home| home.join(".config")))
         .unwrap_or_default()
         .join("telemime")
+}
+
+/// What a program ends with: 0, 1 (failed, with one line on stderr) or 2 (a configuration that cannot be, which has been said).
+pub fn exit_code(program: &str, done: &anyhow::Result<bool>) -> ExitCode {
+    match done {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(2),
+        Err(e) => {
+            eprintln!("{program}: {}", one_line(e.chain()));
+            ExitCode::FAILURE
+        }
+    }
 }
 
 /// The first address a `host:port` stands for.
@@ -292,6 +305,24 @@ pub async fn told(quit: &mut watch::Receiver<bool>) {
     let _ = quit.wait_for(|quit| *quit).await;
 }
 
+/// No word is longer than this with what is said of it, B.
+const LONGEST_LINE: u64 = 4096;
+
+/// Lines, of which what is no UTF-8 is replaced and what is too long comes in pieces: only the end or an error of the source
+/// ends them.
+fn lines(mut from: impl BufRead) -> impl Iterator<Item = String> {
+    let mut bytes = Vec::new();
+    std::iter::from_fn(move || {
+        bytes.clear();
+        let read = from
+            .by_ref()
+            .take(LONGEST_LINE)
+            .read_until(b'\n', &mut bytes);
+        let some = read.is_ok_and(|n| n > 0);
+        some.then(|| String::from_utf8_lossy(&bytes).into_owned())
+    })
+}
+
 /// Ctrl-C, SIGTERM, `quit`, or (if asked for) the end of stdin turn the watch true; the other words of `known`
 /// arrive as such (`stop` is also called at once, on the reading thread). stdin is read only when it is a terminal or `follow_stdin` is set.
 ///
@@ -319,7 +350,7 @@ pub fn listen(
     if follow_stdin || io::stdin().is_terminal() {
         // A thread of its own, never joined: a blocking read cannot be cancelled, and ends with the process.
         thread::Builder::new().name("stdin".into()).spawn(move || {
-            for line in io::stdin().lock().lines().map_while(Result::ok) {
+            for line in lines(io::stdin().lock()) {
                 let line = line.trim();
                 if line == "quit" {
                     break;
@@ -365,6 +396,15 @@ mod tests {
         }
         assert_eq!(Word::parse("keep", ROBOT_WORDS), None);
         assert_eq!(Word::parse("reset", ROBOT_WORDS), Some(Word::Reset));
+    }
+
+    #[test]
+    fn what_is_no_text_ends_nothing() {
+        let said: Vec<_> = lines(&b"x\xff\nstop\nend"[..]).collect();
+        assert_eq!(said, ["x\u{fffd}\n", "stop\n", "end"]);
+        let endless = std::io::repeat(b'a').take(3 * LONGEST_LINE);
+        let pieces: Vec<_> = lines(std::io::BufReader::new(endless)).collect();
+        assert_eq!(pieces.len(), 3);
     }
 
     #[test]

@@ -184,6 +184,9 @@ pub enum PeersError {
         /// The key it is to have.
         new: Fingerprint,
     },
+    /// The address would not be read back as one.
+    #[error("{0:?} is no address: HOST:PORT, without blanks")]
+    Address(String),
     /// The key was revoked.
     #[error(
         "the key {key} of {name} was revoked: run `telemime peers remove {name}` first if it is to be trusted again"
@@ -323,8 +326,14 @@ impl Peers {
     /// Trusts `peer` from now on. A key that is there already keeps its line, with the new name and address.
     ///
     /// # Errors
-    /// [`PeersError::NameTaken`], [`PeersError::AddressTaken`], [`PeersError::Revoked`].
+    /// [`PeersError::Address`], [`PeersError::NameTaken`], [`PeersError::AddressTaken`], [`PeersError::Revoked`].
     pub fn pin(&mut self, peer: Peer) -> Result<(), PeersError> {
+        let unreadable = |text: &&String| {
+            text.is_empty() || text.contains(|c: char| c.is_whitespace() || c.is_control())
+        };
+        if let Some(address) = peer.address.as_ref().filter(unreadable) {
+            return Err(PeersError::Address(address.clone()));
+        }
         for known in self.iter().filter(|p| p.role == peer.role) {
             if known.key == peer.key {
                 if known.revoked {

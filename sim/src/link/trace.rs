@@ -51,7 +51,7 @@ impl TraceFormat {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum TraceError {
     /// The file cannot be read.
-    #[error("{}: cannot be read ({why}): is the name right, seen from the folder this runs in?", path.display())]
+    #[error("{}: cannot be read ({why}): is the name right? It begins at the folder this runs in, in a plan at the plan's", path.display())]
     Read {
         /// Which file.
         path: PathBuf,

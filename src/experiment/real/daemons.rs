@@ -176,6 +176,7 @@ impl Driven<'_> {
         let recording = self.scratch.join("driven.csv");
         std::fs::write(&recording, driven(settings, self.subject).to_csv())?;
         let bound = match settings.future {
+            FutureBound::Share(share) => format!("{share}way"),
             FutureBound::Relative(sigmas) => format!("{sigmas}sigma"),
             FutureBound::Absolute(m) => format!("{m}m"),
         };

@@ -74,8 +74,13 @@ fn course_over(
     for place in places {
         let here = groups.iter().filter(|g| x(g) == Some(place));
         let runs = here.flat_map(|g| g.rows.iter());
-        let values =
-            runs.filter_map(|row| Some((row.person.as_str(), row.figures.get(figure)? * unit)));
+        let values = runs.filter_map(|row| {
+            Some((
+                row.person.as_str(),
+                row.subject.as_str(),
+                row.figures.get(figure)? * unit,
+            ))
+        });
         if let Some(found) = super::group::interval(values) {
             line.push((place, found.mean));
             band.push((place, found.low, found.high));

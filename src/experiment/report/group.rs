@@ -21,26 +21,45 @@ pub(super) struct Interval {
     pub(super) high: f64,
 }
 
-/// The mean over people of each person's mean; the interval by drawing people with replacement (the percentile bootstrap
-/// over clusters: runs of one person are no independent evidence). `None` of nothing.
-pub(super) fn interval<'a>(values: impl IntoIterator<Item = (&'a str, f64)>) -> Option<Interval> {
-    let mut people: BTreeMap<&str, (f64, f64)> = BTreeMap::new();
-    for (person, value) in values {
-        let (sum, n) = people.entry(person).or_default();
+/// The mean over people of the means of their recordings, of `(person, recording, value)`; the interval by drawing people with
+/// replacement, and of each the recordings (the percentile bootstrap over clusters: runs of one recording over other links are
+/// no independent evidence). `None` of nothing.
+pub(super) fn interval<'a>(
+    values: impl IntoIterator<Item = (&'a str, &'a str, f64)>,
+) -> Option<Interval> {
+    let mut people: BTreeMap<&str, BTreeMap<&str, (f64, f64)>> = BTreeMap::new();
+    for (person, recording, value) in values {
+        let (sum, n) = people
+            .entry(person)
+            .or_default()
+            .entry(recording)
+            .or_default();
         *sum += value;
         *n += 1.0;
     }
-    let means: Vec<f64> = people.into_values().map(|(sum, n)| sum / n).collect();
-    if means.is_empty() {
+    let people: Vec<Vec<f64>> = people
+        .into_values()
+        .map(|recordings| recordings.into_values().map(|(sum, n)| sum / n).collect())
+        .collect();
+    if people.is_empty() {
         return None;
     }
-    let n = means.len() as f64;
-    let mean = means.iter().sum::<f64>() / n;
-    let mut rng = Xoshiro256PlusPlus::seed_from_u64(means.len() as u64);
+    let of = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+    let mean = of(&people.iter().map(|own| of(own)).collect::<Vec<_>>());
+    let mut rng = Xoshiro256PlusPlus::seed_from_u64(people.len() as u64);
     let mut resampled: Vec<f64> = (0..RESAMPLES)
         .map(|_| {
-            let draw = |_| means[rng.random_range(0..means.len())];
-            (0..means.len()).map(draw).sum::<f64>() / n
+            let person = |_| {
+                let own = &people[rng.random_range(0..people.len())];
+                match own[..] {
+                    [only] => only,
+                    _ => {
+                        let draw = |_| own[rng.random_range(0..own.len())];
+                        of(&(0..own.len()).map(draw).collect::<Vec<_>>())
+                    }
+                }
+            };
+            of(&(0..people.len()).map(person).collect::<Vec<_>>())
         })
         .collect();
     Some(Interval {
@@ -70,7 +89,9 @@ impl<'a> Group<'a> {
     /// Of anything a run has.
     pub(super) fn each(&self, of: impl Fn(&Row) -> Option<f64>) -> Option<Interval> {
         let values = self.rows.iter();
-        interval(values.filter_map(|row| Some((row.person.as_str(), of(row)?))))
+        interval(
+            values.filter_map(|row| Some((row.person.as_str(), row.subject.as_str(), of(row)?))),
+        )
     }
 }
 
@@ -148,18 +169,23 @@ mod tests {
     #[test]
     fn an_interval_is_over_people_and_not_over_runs() {
         // Ten runs of one person and one of another weigh the same.
-        let mut runs: Vec<(&str, f64)> = vec![("a", 1.0); 10];
-        runs.push(("b", 3.0));
+        let mut runs: Vec<(&str, &str, f64)> = vec![("a", "a1", 1.0); 10];
+        runs.push(("b", "b1", 3.0));
         let both = interval(runs.clone()).unwrap();
         assert_eq!((both.mean, both.low, both.high), (2.0, 1.0, 3.0));
         assert_eq!(interval(runs), Some(both), "the same draws every time");
         assert_eq!(interval([]), None);
         // Of many people it is about 1.96 standard errors either way: here of ±1 by a fair coin, 1/√400.
         let names: Vec<String> = (0..400).map(|n| format!("{n:03}")).collect();
-        let coin = |(n, name): (usize, &'static str)| (name, if n % 2 == 0 { 1.0 } else { -1.0 });
+        let coin =
+            |(n, name): (usize, &'static str)| (name, "1", if n % 2 == 0 { 1.0 } else { -1.0 });
         let leaked: Vec<&'static str> = names.iter().map(|n| &*n.clone().leak()).collect();
         let many = interval(leaked.into_iter().enumerate().map(coin)).unwrap();
         assert!((many.high - 1.96 / 20.0).abs() < 0.02, "{many:?}");
         assert!((many.low + 1.96 / 20.0).abs() < 0.02, "{many:?}");
+        // One person's recordings differ, and each weighs the same however often it was run.
+        let own = [("a", "1", 1.0), ("a", "1", 1.0), ("a", "2", 3.0)];
+        let own = interval(own).unwrap();
+        assert_eq!((own.mean, own.low, own.high), (2.0, 1.0, 3.0));
     }
 }

@@ -3,8 +3,9 @@
 use std::fmt::Write as _;
 
 use super::group::Group;
-use super::page::{escape, plural, scaled};
+use super::page::{escape, scaled};
 use super::view::View;
+use crate::cli::plural;
 use crate::experiment::factor::UNUSED;
 
 /// Figure, unit, decimals.

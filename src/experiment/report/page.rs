@@ -7,6 +7,7 @@ use super::charts::Chart;
 use super::group::{Group, Interval};
 use super::outages::outages;
 use super::view::{View, called, delay_s, value};
+use crate::cli::plural;
 use crate::experiment::factor::{FACTORS, UNUSED};
 use crate::experiment::real::Ground;
 use crate::experiment::store::Manifest;
@@ -56,6 +57,12 @@ pub(super) fn page(
     Ok(out)
 }
 
+/// With fewer, an interval of resampled people is too narrow to be believed.
+const ENOUGH_PEOPLE: usize = 6;
+
+/// With fewer, a link's luck is part of the result.
+const ENOUGH_SEEDS: usize = 10;
+
 fn people(view: &View<'_>) -> usize {
     let rows = view.groups.iter().flat_map(|g| &g.rows);
     let mut names: Vec<&str> = rows.map(|r| r.person.as_str()).collect();
@@ -72,10 +79,6 @@ fn seeds(view: &View<'_>) -> usize {
     all.sort_unstable();
     all.dedup();
     all.len()
-}
-
-pub(super) fn plural(n: usize, one: &str, many: &str) -> String {
-    format!("{n} {}", if n == 1 { one } else { many })
 }
 
 fn summary(view: &View<'_>, manifest: &Manifest) -> String {
@@ -99,11 +102,19 @@ fn summary(view: &View<'_>, manifest: &Manifest) -> String {
         "" => String::new(),
         flags => format!(" A part of the plan: <code>{}</code>.", escape(flags)),
     };
+    let (people, seeds) = (people(view), seeds(view).max(1));
+    let few = if people < ENOUGH_PEOPLE || seeds < ENOUGH_SEEDS {
+        format!(
+            " <strong>A first look and no evidence</strong>: below {ENOUGH_PEOPLE} people or {ENOUGH_SEEDS} seeds the intervals are too narrow."
+        )
+    } else {
+        String::new()
+    };
     format!(
-        "<p class=\"lead\">{} of {}, {driven}, {} of the link’s chances. {ground}{thinned}</p>\n",
+        "<p class=\"lead\">{} of {}, {driven}, {} of the link’s chances. {ground}{thinned}{few}</p>\n",
         plural(manifest.runs, "run", "runs"),
-        plural(people(view), "person", "people"),
-        plural(seeds(view).max(1), "seed", "seeds"),
+        plural(people, "person", "people"),
+        plural(seeds, "seed", "seeds"),
     )
 }
 

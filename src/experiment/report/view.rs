@@ -10,7 +10,7 @@ use crate::experiment::factor::{FACTORS, UNUSED, link};
 use crate::experiment::method::Method;
 use crate::experiment::row::Row;
 use crate::experiment::store::series_path;
-use crate::figure::{BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILLION};
+use crate::figure::{BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION};
 use plotters::style::RGBColor;
 
 /// Pictures of one delay are of the one nearest to this, s.
@@ -198,7 +198,8 @@ pub(super) fn colour(method: &str) -> RGBColor {
         Ok(Method::Ours) => BLUE,
         Ok(Method::Hold) => VERMILLION,
         Ok(Method::Deadband(_)) => ORANGE,
-        Ok(Method::Velocity) => GREEN,
+        Ok(Method::Velocity(1.0)) => GREEN,
+        Ok(Method::Velocity(_)) => SKY,
         Ok(Method::Kalman) => PURPLE,
         Ok(Method::Playback) => GREY,
         Ok(Method::Floor) | Err(_) => BLACK,
@@ -210,8 +211,7 @@ pub(super) fn called(method: &str) -> String {
     match method.parse() {
         Ok(Method::Ours) => "Telemime".into(),
         Ok(Method::Hold) => "raw, held".into(),
-        Ok(Method::Deadband(_)) => method.into(),
-        Ok(Method::Velocity) => "velocity".into(),
+        Ok(Method::Deadband(_) | Method::Velocity(_)) => method.into(),
         Ok(Method::Kalman) => "Kalman".into(),
         Ok(Method::Playback) => "play-back".into(),
         Ok(Method::Floor) => "floor: no network".into(),

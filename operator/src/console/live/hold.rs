@@ -222,6 +222,12 @@ impl Live {
         self.note(format!("{} is learned", skill.name()));
     }
 
+    /// The skill that was chosen is not used, but the one that was.
+    pub fn on_not_used(&mut self, used: Option<String>) {
+        self.using = used;
+        self.note("a skill is being learned");
+    }
+
     /// All strokes that a lesson could not even begin with are back.
     pub fn on_no_lesson(&mut self, strokes: Vec<Demonstration>, why: &LessonError) {
         self.learning = false;

@@ -235,7 +235,8 @@ impl Live {
         let holds = self.hold.as_ref().is_some_and(|hold| hold.page == page);
         match command {
             Command::Stop {} => {
-                self.let_go(session);
+                // The session's stop ends what it drives.
+                self.let_go(None);
                 self.note("emergency stop");
                 return Ok(Some(Act::Stop));
             }

@@ -20,6 +20,7 @@ export class Drive extends EventTarget {
     this.what = null;
     this.granted = false;
     this.recording = false;
+    this.blind = false;
     this.owed = false;
     this.said = 0;
     this.keys = new Set();
@@ -120,7 +121,7 @@ export class Drive extends EventTarget {
 
   near(event) {
     const tip = this.tip();
-    if (!tip) return false;
+    if (!tip || this.blind) return false;
     const at = this.view.project(tip);
     return Math.hypot(at.x - event.offsetX, at.y - event.offsetY) < (event.pointerType === "mouse" ? 26 : 44);
   }

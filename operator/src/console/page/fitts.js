@@ -2,12 +2,15 @@
 
 import { add, along, dot, norm, scale, sub, unit } from "./math.js";
 
-const TARGETS = 9;
+/** With fewer movements in a sequence their end points say nothing of a width. */
+const FEWEST = 3;
 const CIRCLE_M = 0.15;
 const REST_MS = 300;
+/** A hand that has been in the circle for so long has an arm that cannot follow. */
+const HELD_BACK_MS = 2000;
 
-/** The order of the targets on the circle: always across it. */
-export function order(count = TARGETS) {
+/** The order of `count` targets, an odd number, on the circle: always across it. */
+export function order(count) {
   return Array.from({ length: count + 1 }, (_, i) => (Math.floor(i / 2) + (i % 2 ? (count + 1) / 2 : 0)) % count);
 }
 
@@ -40,15 +43,15 @@ export class Fitts extends EventTarget {
     this.run = null;
   }
 
-  /** Two sequences around `centre`, with prediction and without; which comes first alternates. */
-  begin(centre, width) {
+  /** Two sequences of `count` targets around `centre`, with prediction and without; which comes first alternates. */
+  begin(centre, width, count) {
     const first = this.results.length % 4 < 2;
     const { right, up } = this.view;
-    const places = Array.from({ length: TARGETS }, (_, i) => {
-      const angle = (i / TARGETS) * 2 * Math.PI;
+    const places = Array.from({ length: count }, (_, i) => {
+      const angle = (i / count) * 2 * Math.PI;
       return add(centre, add(scale(right, (CIRCLE_M / 2) * Math.sin(angle)), scale(up, (CIRCLE_M / 2) * Math.cos(angle))));
     });
-    this.run = { places, width, x: right, y: up, out: this.view.forward, gains: first ? [1, 0] : [0, 1] };
+    this.run = { places, width, x: right, y: up, out: this.view.forward, gains: first ? [1, 0] : [0, 1], before: this.link.now?.gain ?? 1 };
     this.sequence();
   }
 
@@ -56,21 +59,23 @@ export class Fitts extends EventTarget {
     const { run } = this;
     const gain = run.gains.shift();
     if (gain === undefined) {
-      this.run = null;
-      this.link.say({ do: "predict", gain: 1 });
-      this.tell("Done. The table and the CSV have the result.");
+      const bits = (on) => this.results.slice(-2).find((r) => r.gain === on).throughput.toFixed(2);
+      this.finish(`Done: ${bits(1)} bit/s with prediction, ${bits(0)} without.`);
       return;
     }
-    Object.assign(run, { gain, order: order(), at: 0, from: null, broken: false, trials: [], lit_t: null, rest: [], reports: [] });
+    Object.assign(run, { gain, order: order(run.places.length), at: 0, from: null, broken: false, trials: [], lit_t: null, held_t: null, rest: [], delays: [] });
     this.link.say({ do: "predict", gain });
     this.tell(`Prediction ${gain ? "on" : "off"}: bring the tip into the lit circle.`);
   }
 
   cancel() {
-    if (!this.run) return;
+    if (this.run) this.finish("Cancelled.");
+  }
+
+  finish(text) {
+    this.link.say({ do: "predict", gain: this.run.before });
     this.run = null;
-    this.link.say({ do: "predict", gain: 1 });
-    this.tell("Cancelled.");
+    this.tell(text);
   }
 
   tell(text) {
@@ -87,26 +92,34 @@ export class Fitts extends EventTarget {
     return run ? `${run.at} of ${run.order.length - 1}, prediction ${run.gain ? "on" : "off"}` : "";
   }
 
-  /** A report of the arm: its tip at `t` ms, and `now` ms on the same clock. */
-  take(t, tip, now, engaged) {
+  /** A snapshot with a new report of the arm. */
+  take({ t: now, arm: { t, tip, delay_ms }, hand, robot, you, gain }) {
     const { run } = this;
     if (!run) return;
-    if (!engaged) {
+    if (robot?.state !== "Engaged" || you !== true || gain !== run.gain) {
       // A movement that was interrupted is none: what is left of it says nothing.
       run.broken = true;
-      run.lit_t = null;
+      run.lit_t = run.held_t = null;
       run.rest = [];
       return;
     }
     run.lit_t ??= now;
+    run.delays.push(delay_ms);
     const target = run.places[run.order[run.at]];
     // Depth is not asked for: the circle lies in the picture's plane.
-    const off = sub(tip, target);
-    const flat = along(off, run.out, -dot(off, run.out));
-    if (norm(flat) > run.width / 2) {
+    const within = (p) => {
+      const off = sub(p, target);
+      const flat = along(off, run.out, -dot(off, run.out));
+      return norm(flat) <= run.width / 2 ? flat : null;
+    };
+    const flat = within(tip);
+    if (!flat) {
       run.rest = [];
+      run.held_t = hand && within(hand.p) ? run.held_t ?? now : null;
+      if (run.held_t !== null && now - run.held_t > HELD_BACK_MS) this.tell("A limit keeps the arm from this circle: cancel, bring the arm to the middle of its reach, and start there.");
       return;
     }
+    run.held_t = null;
     run.rest.push({ t, p: add(target, flat) });
     if (t - run.rest[0].t < REST_MS) return;
     this.reached(now);
@@ -127,18 +140,25 @@ export class Fitts extends EventTarget {
     run.lit_t = now;
     run.rest = [];
     if (run.at < run.order.length) return;
-    this.results.push({ gain: run.gain, nominal: run.width, trials: run.trials, ...throughput(run.trials) });
+    if (run.trials.length < FEWEST) {
+      run.gains.unshift(run.gain);
+      this.sequence();
+      this.tell("The clutch was let go too often for a result: this sequence once more.");
+      return;
+    }
+    const delay_ms = run.delays.reduce((sum, v) => sum + v, 0) / run.delays.length;
+    this.results.push({ gain: run.gain, targets: run.places.length, delay_ms, nominal: run.width, trials: run.trials, ...throughput(run.trials) });
     this.dispatchEvent(new Event("result"));
     this.sequence();
   }
 
   /** Every movement as a line. */
   csv() {
-    const head = "sequence,prediction,width_m,movement,distance_m,miss_m,time_s,effective_width_m,throughput_bit_s";
+    const head = "sequence,prediction,circles,delay_ms,width_m,movement,distance_m,miss_m,time_s,effective_width_m,throughput_bit_s";
     const rows = this.results.flatMap((r, i) => r.trials.map((t, k) => {
       const way = sub(t.to, t.from);
       const miss = dot(sub(t.end, t.to), unit(way));
-      return [i + 1, r.gain, r.nominal, k + 1, norm(way).toFixed(4), miss.toFixed(5), t.time_s.toFixed(3), r.width.toFixed(5), r.throughput.toFixed(3)].join(",");
+      return [i + 1, r.gain, r.targets, r.delay_ms.toFixed(1), r.nominal, k + 1, norm(way).toFixed(4), miss.toFixed(5), t.time_s.toFixed(3), r.width.toFixed(5), r.throughput.toFixed(3)].join(",");
     }));
     return [head, ...rows].join("\n") + "\n";
   }

@@ -24,12 +24,37 @@ const fitts = new Fitts(link, view);
 const panel = new Panel(link, drive, fitts);
 const plots = new Plots($("plots"));
 let scene = null;
-try {
-  scene = new Scene(canvas, view);
-} catch (error) {
-  $("plain").hidden = false;
-  panel.log(`no picture: ${error.message}`);
+
+function see() {
+  try {
+    scene = new Scene(canvas, view);
+  } catch (error) {
+    return blind(error.message);
+  }
+  shows(true);
 }
+
+/** Nobody takes hold of what is not seen; the keys and the buttons remain. */
+function blind(why) {
+  scene = null;
+  drive.end();
+  panel.log(`no picture: ${why}`);
+  shows(false);
+}
+
+function shows(seen) {
+  drive.blind = !seen;
+  $("plain").hidden = seen;
+  $("stage").classList.toggle("blind", !seen);
+}
+
+see();
+canvas.addEventListener("webglcontextlost", (event) => {
+  // Or it would never be given back.
+  event.preventDefault();
+  blind("the browser took the graphics away");
+});
+canvas.addEventListener("webglcontextrestored", see);
 
 let [measured, before, last] = [{}, null, null];
 
@@ -39,12 +64,14 @@ link.addEventListener("now", ({ detail: now }) => {
     last = now.arm.t;
     smooth.take(now.arm.t, now.arm.q, now.arm.tip);
     tip.take(now.arm.t, now.arm.tip);
-    if (fresh) fitts.take(now.arm.t, now.arm.tip, now.t, now.robot?.state === "Engaged" && now.you === true);
+    if (fresh) fitts.take(now);
   }
   if (now.hand) hand.take(now.hand.t, now.hand.p);
   else hand.clear();
   measure(now);
 });
+
+link.addEventListener("link", ({ detail: { open } }) => open || plots.silent());
 
 /** Four times a second: rates, and how far the arm is behind the hand. */
 function measure(now) {
@@ -58,7 +85,9 @@ function measure(now) {
   const unhidden = arm && robot ? arm.delay_ms + robot.lag_ms : null;
   measured = {
     age: following ? arm?.age_ms : null, delay: arm?.delay_ms, lag,
-    hidden: lag === null ? null : unhidden - lag, clamps: arm?.clamps, lost: arm?.lost, seen: now.seen,
+    hidden: lag === null ? null : unhidden - lag, clamps: arm?.clamps, lost: arm?.lost,
+    // What was recognised last is no news once the hand is let go.
+    seen: following ? now.seen : null, tip: arm?.tip,
   };
   panel.figures(measured);
   plots.take(now.t, {
@@ -77,15 +106,22 @@ function frame(time) {
   const held = drive.what === "hand" || drive.what === "record";
   // What the daemon made of the hand lies where the arm is to be; the hand of this very frame is fresher.
   const offset = now?.offset ?? [0, 0, 0];
-  const place = held && drive.p ? drive.p.map((v, i) => v + (drive.what === "record" ? 0 : offset[i])) : tipShown();
-  if (scene?.due(time)) {
+  // Whoever watches sees the hand of the page that drives, as the daemon has it.
+  const watched = !drive.what && (now?.driving === "hand" || now?.driving === "record") ? now.hand?.p : null;
+  const place = watched ?? (held && drive.p ? drive.p.map((v, i) => v + (drive.what === "record" ? 0 : offset[i])) : tipShown());
+  const moves = held || watched != null;
+  const drives = moves && now?.driving === "hand";
+  const looks = [moves, now?.linked, link.arm?.joints.length, shown?.q, place, fitts.run?.gain, fitts.run?.at];
+  if (scene?.due(time) && (scene.differs(looks) || moves)) {
     scene.draw({
-      arm: link.arm, q: shown?.q, hand: now?.linked ? place : null, held,
-      ghost: held && now?.arm && now.hand ? hand.at(now.t - now.arm.delay_ms) : null,
-      trail: held ? hand.since((now?.hand?.t ?? 0) - 1200).map((s) => s.p) : [],
+      arm: link.arm, q: shown?.q, hand: now?.linked ? place : null, held: moves,
+      ghost: drives && now.arm && now.hand ? hand.at(now.t - now.arm.delay_ms) : null,
+      trail: moves ? hand.since((now?.hand?.t ?? 0) - 1200).map((s) => s.p) : [],
       path: now?.path, knots: now?.knots, targets: fitts.targets,
     });
   }
+  $("stale").hidden = !link.arm || !scene || now?.linked === true;
+  $("stage").classList.toggle("stale", now?.linked !== true);
   $("fitts-score").hidden = !fitts.run;
   $("fitts-score").textContent = fitts.count;
   plots.draw(time);
@@ -94,4 +130,4 @@ function frame(time) {
 requestAnimationFrame(frame);
 
 // For whoever tests the page.
-globalThis.telemime = { link, view, scene, drive, fitts, tip: tipShown, hand: () => hand.all.at(-1)?.p ?? null, measured: () => measured };
+globalThis.telemime = { link, view, get scene() { return scene; }, drive, fitts, tip: tipShown, hand: () => hand.all.at(-1)?.p ?? null, measured: () => measured };

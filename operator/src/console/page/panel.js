@@ -8,7 +8,11 @@ const CAUSES = {
   LeaseExpired: "no news in time: stopped by itself. Press again to go on", PlanFinished: "played to its end",
   ConnectionLost: "the connection ended: it holds", OperatorStop: "stopped from here", LocalStop: "stopped at the robot: reset it there",
   ClockStep: "the clock jumped: press again", Fault: "the robot fell behind: press again",
+  ArmFault: "what drives the arm failed: see the robot's log, then press again",
 };
+
+/** What the clutch is held for. */
+const DOING = { hand: "following the hand", play: "playing a skill", record: "recording a stroke: the arm stays" };
 
 export class Panel {
   constructor(link, drive, fitts) {
@@ -20,6 +24,9 @@ export class Panel {
     this.buttons();
     this.sliders();
     this.measuring();
+    this.gone = false;
+    // What stays in sight of a small screen stays below the header, however many lines that has.
+    new ResizeObserver(([{ target }]) => document.body.style.setProperty("--head", `${target.offsetHeight}px`)).observe(document.querySelector("header"));
     link.addEventListener("link", (event) => this.onLink(event.detail));
     link.addEventListener("now", (event) => this.onNow(event.detail));
     drive.addEventListener("change", () => this.pressed());
@@ -74,14 +81,15 @@ export class Panel {
     $("fitts-start").addEventListener("click", () => {
       if (fitts.run) return fitts.cancel();
       const tip = drive.tip();
-      if (tip) fitts.begin(tip, +$("width").value);
+      if (tip) fitts.begin(tip, +$("width").value, +$("circles").value);
     });
     $("fitts-csv").addEventListener("click", () => {
       const link = document.createElement("a");
       link.href = URL.createObjectURL(new Blob([fitts.csv()], { type: "text/csv" }));
       link.download = "fitts.csv";
       link.click();
-      URL.revokeObjectURL(link.href);
+      // A browser may begin to read only after this event.
+      setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
     });
     fitts.addEventListener("say", (event) => {
       $("fitts-say").textContent = event.detail;
@@ -103,9 +111,19 @@ export class Panel {
   }
 
   onLink({ open, why }) {
-    if (open) return;
-    this.state("", why ? `disconnected: ${why}` : "the operator daemon does not answer");
+    if (open) {
+      if (this.gone) this.log("connected again");
+      this.gone = false;
+      return;
+    }
+    // It calls again every second: that is no news.
+    if (!this.gone) this.log(why ? `disconnected: ${why}` : "the operator daemon does not answer");
+    this.gone = true;
+    this.state("", why || "the operator daemon does not answer");
     this.show("state-name", "disconnected");
+    $("hold").disabled = $("play").disabled = true;
+    $("reset").hidden = true;
+    this.figures({});
   }
 
   state(state, why) {
@@ -122,14 +140,15 @@ export class Panel {
   onNow(now) {
     const { robot } = now;
     const state = now.linked ? robot?.state ?? "" : "";
-    const held = now.you === false ? "another page drives" : "";
-    this.state(state, now.linked ? held || (CAUSES[robot?.cause] ?? robot?.cause ?? "") : now.why);
+    const doing = now.you === false ? `another page drives: ${DOING[now.driving]}` : DOING[now.driving];
+    this.state(state, now.linked ? (CAUSES[robot?.cause] ?? robot?.cause) || (doing ?? "") : now.why);
     this.show("robot", robot ? robot.name : "no robot yet");
     $("reset").hidden = state !== "Stopped";
     $("hold").disabled = $("play").disabled = !state || state === "Stopped" || now.you === false;
     $("play").disabled ||= !now.skills.length;
     // What was just switched is not switched back by what was said before.
     if (performance.now() - this.switched > 500) $("predict").checked = now.gain > 0;
+    $("predict").disabled = this.fitts.run !== null;
     this.teaching(now);
     this.shape(now.shape);
     for (const [id, text] of now.notes) {
@@ -160,13 +179,14 @@ export class Panel {
     }
   }
 
-  figures({ age, lag, hidden, clamps, seen, lost }) {
+  figures({ age, lag, hidden, clamps, seen, lost, tip }) {
     const ms = (value) => (Number.isFinite(value) ? `${Math.round(value)} ms` : "–");
     this.show("age", ms(age));
     this.show("lag", ms(lag));
     this.show("hidden", ms(hidden));
     this.show("clamps", clamps === undefined ? "–" : `${clamps}`);
     this.show("lost", lost === undefined ? "–" : `${lost}`);
+    this.show("where", tip ? `${tip.map((v) => v.toFixed(2)).join(", ")} m (x, y, z)` : "–");
     this.show("skill", !seen ? "–" : seen.skill ? `${seen.skill} ${Math.round(seen.phase * 100)} %` : seen.what.toLowerCase());
   }
 

@@ -19,6 +19,7 @@ export class Plots {
     this.rows = [];
     this.slow = matchMedia("(prefers-reduced-motion: reduce)");
     this.drawn = 0;
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => (this.fresh = true));
     this.plots = PLOTS.map((plot) => {
       const figure = document.createElement("figure");
       const caption = document.createElement("figcaption");
@@ -39,12 +40,22 @@ export class Plots {
     if (this.rows.length && t < this.rows.at(-1).t) this.rows = [];
     this.rows.push({ t, ...row });
     while (this.rows[0].t < t - SPAN_MS) this.rows.shift();
+    this.fresh = true;
+  }
+
+  /** What was said last is not so any more. */
+  silent() {
+    for (const { value, canvas, name } of this.plots) {
+      value.textContent = "–";
+      canvas.setAttribute("aria-label", `${name}: unknown`);
+    }
   }
 
   draw(now) {
     // Nothing scrolls for those who asked for rest: twice a second is enough to read.
-    if (now - this.drawn < (this.slow.matches ? 500 : 100) || !this.rows.length) return;
+    if (now - this.drawn < (this.slow.matches ? 500 : 100) || !this.fresh) return;
     this.drawn = now;
+    this.fresh = false;
     const style = getComputedStyle(this.root);
     this.plots.forEach((plot) => this.strip(plot, style));
   }

@@ -7,13 +7,13 @@ import { LINE, Renderer, SHADOW } from "./render.js";
 const LIGHT = {
   ground: [0.933, 0.945, 0.957], grid: [0.72, 0.76, 0.8, 0.8], shadow: [0.83, 0.85, 0.875, 1],
   link: [0.96, 0.965, 0.97, 1], joint: [0.1, 0.47, 0.45, 1], tip: [0.13, 0.16, 0.2, 1],
-  hand: [0.13, 0.37, 0.87, 1], ghost: [0.45, 0.5, 0.56, 0.55], tube: [0.05, 0.56, 0.52, 0.16], path: [0.05, 0.56, 0.52, 0.9],
+  hand: [0.13, 0.37, 0.87, 1], ghost: [0.45, 0.5, 0.56, 0.55], tube: [0.05, 0.56, 0.52, 0.09], path: [0.05, 0.56, 0.52, 0.9],
   knot: [0.85, 0.52, 0.02, 1], trail: [0.13, 0.37, 0.87, 0.25], target: [0.8, 0.13, 0.2, 0.85], other: [0.5, 0.55, 0.6, 0.5],
 };
 const DARK = {
   ground: [0.071, 0.086, 0.106], grid: [0.3, 0.36, 0.42, 0.7], shadow: [0.04, 0.05, 0.062, 1],
   link: [0.72, 0.75, 0.79, 1], joint: [0.16, 0.62, 0.58, 1], tip: [0.86, 0.9, 0.94, 1],
-  hand: [0.36, 0.6, 1, 1], ghost: [0.62, 0.68, 0.74, 0.5], tube: [0.24, 0.8, 0.74, 0.17], path: [0.3, 0.85, 0.78, 0.9],
+  hand: [0.36, 0.6, 1, 1], ghost: [0.62, 0.68, 0.74, 0.5], tube: [0.24, 0.8, 0.74, 0.09], path: [0.3, 0.85, 0.78, 0.9],
   knot: [1, 0.76, 0.28, 1], trail: [0.36, 0.6, 1, 0.25], target: [1, 0.35, 0.38, 0.85], other: [0.5, 0.56, 0.62, 0.5],
 };
 
@@ -52,6 +52,16 @@ export class Scene {
     if (this.pace > 45 && this.quality > 0.35) [this.quality, this.pace] = [this.quality * 0.7, 16];
     this.next = took > 34 ? time + took : 0;
     this.asked = this.next || time;
+    return true;
+  }
+
+  /** Whether a picture of `what` (numbers, however nested) differs from the last that was asked about, as far as an eye can see. */
+  differs(what) {
+    const { clientWidth, clientHeight } = this.canvas;
+    const seen = JSON.stringify([what, this.view.eye, clientWidth, clientHeight, this.quality, this.colours === DARK],
+      (_, v) => (typeof v === "number" ? Math.round(v * 5000) : v));
+    if (seen === this.seen) return false;
+    this.seen = seen;
     return true;
   }
 

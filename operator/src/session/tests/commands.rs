@@ -82,6 +82,78 @@ fn every_refusal_but_a_divergence_ends_the_attempt() {
     }
 }
 
+fn granted(engagement: u32) -> RobotControl {
+    RobotControl::Engaged {
+        engagement,
+        t_us: 0,
+        hand_m: [0.0; 3],
+        tip_m: [0.0; 3],
+        hand_q: None,
+        tip_q: WireRotation::default(),
+    }
+}
+
+/// A trigger that bounces: the second request is declined while the third is under way, which is then granted.
+#[test]
+fn what_is_granted_after_it_was_given_up_is_let_go() {
+    let release = |engagement| OperatorControl::Release { engagement };
+    let mut bench = Bench::ready(SessionConfig::default(), None);
+    bench.sample(home());
+    bench.session.engage(bench.now);
+    bench.session.release();
+    bench.session.engage(bench.now);
+    bench.drain();
+    bench.forget();
+    bench.hears(&refused(Refusal::Moving));
+    assert_eq!(bench.control, [release(2)], "it may yet be granted");
+    assert_eq!(bench.events, [Event::Refused(Refusal::Moving)]);
+    bench.hears(&granted(2));
+    assert_eq!(bench.control, [release(2), release(2)]);
+    assert_eq!(bench.events.len(), 1, "nobody is told that it follows");
+
+    // Asked again before the grant comes: what is granted is not what is asked for.
+    bench.session.engage(bench.now);
+    bench.drain();
+    bench.forget();
+    bench.hears(&granted(2));
+    assert_eq!(bench.control, [release(2)]);
+    assert!(
+        bench
+            .events
+            .iter()
+            .all(|e| !matches!(e, Event::Engaged { .. }))
+    );
+    bench.hears(&granted(3));
+    assert!(matches!(
+        bench.events.last(),
+        Some(Event::Engaged { engagement: 3, .. })
+    ));
+    bench.session.release();
+    bench.drain();
+    assert_eq!(bench.control.last(), Some(&release(3)));
+}
+
+#[test]
+fn a_stop_is_said_before_a_model_that_has_waited() {
+    let mut bench = Bench::engaged(SessionConfig::default(), Some(example(2, 24)));
+    bench
+        .session
+        .replace_skill(std::sync::Arc::new(example(3, 24)));
+    bench.session.stop(bench.now);
+    bench.drain();
+    assert!(
+        matches!(
+            bench.control[..],
+            [
+                OperatorControl::EmergencyStop,
+                OperatorControl::Model { .. }
+            ]
+        ),
+        "{:?}",
+        bench.control
+    );
+}
+
 #[test]
 fn what_a_declined_request_took_is_not_counted() {
     let mut bench = Bench::ready(SessionConfig::default(), None);
@@ -97,9 +169,10 @@ fn what_a_declined_request_took_is_not_counted() {
     bench.session.engage(bench.now);
     for i in 0..10 {
         bench.now.0 += 33 * MS;
+        let x = home() + Vector3::x() * 0.1 * f64::from((i - 6).max(0));
         let sample = HandSample {
             resting: i < 7,
-            ..HandSample::at(bench.now, home())
+            ..HandSample::at(bench.now, x)
         };
         bench.session.handle_sample(bench.now, sample);
     }
@@ -107,14 +180,7 @@ fn what_a_declined_request_took_is_not_counted() {
     assert_eq!((counters.rest_samples, counters.samples), (7, 3));
     assert!(0 < counters.rest_messages && counters.rest_messages < counters.messages);
     assert!(0 < counters.rest_knots && counters.rest_knots <= counters.knots);
-    bench.hears(&RobotControl::Engaged {
-        engagement: 3,
-        t_us: 0,
-        hand_m: [0.0; 3],
-        tip_m: [0.0; 3],
-        hand_q: None,
-        tip_q: WireRotation::default(),
-    });
+    bench.hears(&granted(3));
     bench.hears(&refused(Refusal::NotYours));
     // What was driven is let go, and its path told to the end; nothing of it is taken back.
     let knots = bench.session.counters().knots;

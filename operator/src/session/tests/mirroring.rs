@@ -102,6 +102,38 @@ fn a_hand_at_rest_is_confirmed_at_the_largest_silence_and_no_oftener() {
 }
 
 #[test]
+fn a_share_of_the_way_is_a_distance_for_every_skill() {
+    // In the arm's lag, which is all there is to bridge here, at the half metre a second along each axis that is
+    // taken for usual where nothing else is known, and that the example's calibration states.
+    let way_m = 0.07 * 0.75_f64.sqrt();
+    for skill in [None, Some(example(2, 24))] {
+        let said = |future_bound| {
+            let config = SessionConfig {
+                future_bound,
+                ..SessionConfig::default()
+            };
+            let mut bench = Bench::engaged(config, skill.clone());
+            for i in 0..90 {
+                let phase = 0.2 * f64::from(i);
+                let way = Vector3::new(phase.sin(), 0.3 * (0.7 * phase).sin(), 0.0);
+                bench.sample(home() + way * 0.4);
+            }
+            bench.datagrams
+        };
+        let share = said(FutureBound::Share(0.1));
+        assert_eq!(share, said(FutureBound::Absolute(0.1 * way_m)));
+        let widest = said(FutureBound::Share(1e3));
+        assert_eq!(widest, said(FutureBound::Relative(2.0)));
+        assert!(
+            widest.len() < share.len(),
+            "{} {}",
+            widest.len(),
+            share.len()
+        );
+    }
+}
+
+#[test]
 fn it_speaks_when_the_robots_prediction_goes_wrong_and_only_then() {
     let mut bench = Bench::engaged(bound(0.05), None);
     let v = Vector3::new(1.0, 0.0, 0.0);

@@ -48,6 +48,28 @@ fn a_hand_that_only_turns_or_grips_is_told_of() {
 }
 
 #[test]
+fn an_orientation_has_a_way_of_its_own_no_finer_than_what_is_predicted() {
+    let said = |future_bound| {
+        let config = SessionConfig {
+            future_bound,
+            ..SessionConfig::default()
+        };
+        let mut bench = Bench::engaged(config, Some(posed_example(2, 24)));
+        for i in 0..90 {
+            let angle = 0.3 * (0.3 * f64::from(i)).sin();
+            pose(&mut bench, Some(Vector3::z() * angle), None);
+        }
+        bench.datagrams
+    };
+    let (fine, wide) = (
+        said(FutureBound::Share(0.1)),
+        said(FutureBound::Share(10.0)),
+    );
+    assert_eq!(fine, said(FutureBound::Relative(1.5)));
+    assert!(fine.len() > 2 * wide.len(), "{} {}", fine.len(), wide.len());
+}
+
+#[test]
 fn what_the_tracker_loses_is_held_and_what_is_no_orientation_is_not_taken() {
     let mut bench = engaged(None);
     let turn = Vector3::new(0.3, -0.2, 0.1);

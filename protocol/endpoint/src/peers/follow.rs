@@ -60,20 +60,30 @@ impl Source {
     }
 
     /// Keeps `trust` up to date with the store for as long as it is polled. A store that cannot be read changes
-    /// nothing, and is complained of once.
+    /// nothing and is complained of once; it is read again when it changes, or until it can be.
     pub async fn follow(&self, trust: &Trust, mut complain: impl FnMut(PeersError)) {
         let mut look = interval(LOOK);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut seen = None;
+        let (mut seen, mut unread) = (None, None);
         loop {
             look.tick().await;
             let now = Some(self.stamp());
-            if now != seen {
-                seen = now;
-                if let Err(e) = self.read(trust) {
-                    complain(e);
-                }
+            if now == seen {
+                continue;
             }
+            match self.read(trust) {
+                Err(e @ PeersError::Io { .. }) => {
+                    // Nothing is wrong with the file itself: what it says now is still to be learned.
+                    if unread != now {
+                        unread = now;
+                        complain(e);
+                    }
+                    continue;
+                }
+                Err(e) => complain(e),
+                Ok(()) => {}
+            }
+            (seen, unread) = (now, None);
         }
     }
 

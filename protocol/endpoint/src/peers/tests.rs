@@ -156,3 +156,15 @@ async fn a_change_of_the_store_is_followed_and_a_damaged_one_changes_nothing() {
     }
     assert_eq!(complaints.len(), 1, "{complaints:?}");
 }
+
+#[test]
+fn an_address_that_would_not_be_read_back_is_not_written() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("peers");
+    for address in ["lab arm:4433", "", "lab:1\nx robot", "lab\t:1"] {
+        let wrong = pin(&path, peer("arm", Role::Robot, 1, Some(address)));
+        assert!(matches!(wrong, Err(PeersError::Address(_))), "{address:?}");
+    }
+    pin(&path, peer("arm", Role::Robot, 1, Some("lab:1"))).unwrap();
+    assert_eq!(Peers::load(&path).unwrap().iter().count(), 1);
+}

@@ -172,3 +172,46 @@ fn cardinal(knots: &[f64], j: usize, t: &[f64]) -> Vec<f64> {
     });
     values
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::super::bounded::{Effort, bounded_with};
+    use super::*;
+
+    #[test]
+    fn it_takes_fewer_bytes_and_keeps_the_bound() {
+        let bound_m = 0.02;
+        let (mut before, mut after) = (0, 0);
+        for seed in 0..8 {
+            let t: Vec<f64> = (0..120).map(|i| f64::from(i) / 30.0).collect();
+            let noise = |i: usize| f64::from((i as u32 * 7919 + seed * 104_729) % 101) * 1e-4;
+            let at = |(i, t): (usize, &f64)| {
+                let phase = (2.0 + 0.3 * f64::from(seed)) * t;
+                let x = Vector3::new(libm::sin(phase), libm::cos(1.7 * phase), 0.2 * phase);
+                x * 0.4 + Vector3::new(noise(i), noise(3 * i), noise(5 * i))
+            };
+            let y: Vec<_> = t.iter().enumerate().map(at).collect();
+            let plan = bounded_with(&t, &y, bound_m, Effort::Brisk).unwrap();
+            let cheaper = cheapen(&plan, &Motion::new(&t, &y), bound_m * (1.0 - 1e-7)).unwrap();
+            let curve = cheaper.spline().unwrap();
+            let (start_s, end_s) = curve.span_s();
+            for (t, y) in t.iter().zip(&y) {
+                let x = curve.eval(t.clamp(start_s, end_s)).unwrap().x;
+                assert!((x - y).norm() <= bound_m);
+            }
+            before += plan.byte_len();
+            after += cheaper.byte_len();
+        }
+        assert!(after < before, "{after} of {before} bytes");
+    }
+
+    #[test]
+    fn what_is_beyond_the_bound_is_left_as_it_is() {
+        let (t, y) = ([0.0, 0.5, 1.0], [0.0, 1.01, 0.0].map(Vector3::repeat));
+        let plan = bounded_with(&t, &y, 0.1, Effort::Quick).unwrap();
+        let motion = Motion::new(&t, &y);
+        assert_eq!(cheapen(&plan, &motion, 1e-6).unwrap(), plan);
+    }
+}
