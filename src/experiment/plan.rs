@@ -245,7 +245,7 @@ impl Reader<'_> {
                 "wrist" | "every" => {
                     let flag = value.get_ref().as_bool();
                     let flag = flag.ok_or_else(|| self.type_of(value, name, "true or false"))?;
-                    match &*name {
+                    match name {
                         "wrist" => motion.wrist = flag,
                         _ => motion.every = flag,
                     }
