@@ -27,7 +27,7 @@ use super::tap::{Watched, Watcher};
 /// What it was written for, and a black box.
 type Record = (Due, Vec<u8>);
 
-/// The robot of a [`Pair`]: what it reports, tick by tick.
+/// The robot of a [`Pair`](super::Pair): what it reports, tick by tick.
 #[derive(Clone)]
 pub struct Robot {
     reports: Rc<RefCell<Vec<Report>>>,
@@ -39,7 +39,7 @@ pub struct Robot {
     tasks: Rc<[tokio::task::AbortHandle; 2]>,
 }
 
-/// An operator of a [`Pair`], running.
+/// An operator of a [`Pair`](super::Pair), running.
 pub struct Operator {
     /// The end of its task, and what it was.
     pub done: tokio::task::JoinHandle<(Result<Summary, DaemonError>, Task)>,
@@ -143,7 +143,7 @@ impl Robot {
         self.reports.borrow()
     }
 
-    /// What its black box has written so far, if the pair was [started with one](Pair::start_recorded).
+    /// What its black box has written so far, if the pair was [started with one](super::Pair::start_recorded).
     pub fn records(&self) -> std::cell::Ref<'_, Vec<Record>> {
         self.records.borrow()
     }
