@@ -163,7 +163,7 @@ def check_rerun(paths):
     try:
         import rerun
     except ImportError:
-        print("rerun-sdk is not installed: the recordings were not opened with it")
+        print("SKIPPED: rerun-sdk is not installed: the recordings were not opened with it", file=sys.stderr)
         return
     for path in paths:
         out = path.with_suffix(".rrd")
