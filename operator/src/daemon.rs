@@ -176,10 +176,11 @@ impl Daemon {
                 )
                 .await;
             self.ended(&session);
+            let of_link = session.seen();
+            last.jittered(of_link.up.iter().chain([&of_link.down]));
             seen = Some(last);
             stop = session.stop_is_unconfirmed();
             summary.counters.add(session.counters());
-            let of_link = session.seen();
             if of_link.up.is_some() || summary.seen.up.is_none() {
                 summary.seen = of_link;
             }

@@ -11,12 +11,13 @@ use std::time::Duration;
 use quinn::{ConnectError, Connecting, Connection, Endpoint};
 use telemime_endpoint::control::{Control, ControlError, Writer};
 use telemime_endpoint::quic::{self, Refusal};
+use telemime_endpoint::reception::Received;
 use telemime_protocol::wire::frame::{self, Frame};
 use telemime_protocol::wire::hello::{Answer, RejectCode};
 use telemime_protocol::wire::{Version, Versions};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
-use tokio::time::{Instant, sleep_until, timeout};
+use tokio::time::{Instant, sleep, sleep_until, timeout};
 
 /// Attempts begin this far apart …
 pub const REDIAL: Duration = Duration::from_millis(250);
@@ -41,9 +42,21 @@ const UNDISTURBED: Duration = Duration::from_secs(2);
 /// The longest time-out of an attempt.
 const LONGEST_ATTEMPT: Duration = Duration::from_secs(10);
 
-/// No answer to our greeting for so long: it may have overtaken the handshake's last packets, and is then thrown away. QUIC says
-/// it again after three round trips, or one if something later has arrived.
+/// A greeting that overtakes the handshake's last packet is thrown away, for the robot has no key to it yet. So it is held back:
+/// for so long, or half the round trip if that is less …
+const HOLD: Duration = Duration::from_millis(20);
+
+/// … or so many times the jitter last seen (RFC 3550 §6.4.1), if that is more: packets whose delays spread evenly are never
+/// farther apart than three times the mean that it estimates …
+const JITTERS: u32 = 4;
+
+/// … but no longer than this.
+const LONGEST_HOLD: Duration = Duration::from_millis(100);
+
+/// No answer for so long after the greeting, or after something else: it may have been thrown away all the same. QUIC
+/// says it again after three round trips, or after one if packets that came later are acknowledged; a pair of them is at once.
 const NUDGE: Duration = Duration::from_millis(30);
+const NUDGES: u32 = 2;
 
 /// Application close code of a robot that does not trust our key (docs/protocol.md §1).
 const NOT_TRUSTED: u32 = 5;
@@ -65,6 +78,7 @@ impl Link {
         Seen {
             rtt: quic::least_rtt(&self.connection),
             answered: self.answered,
+            jitter: Duration::ZERO,
         }
     }
 }
@@ -73,6 +87,12 @@ impl Seen {
     /// The least round trip counts: what a queue adds is no part of the path, and would have attempts wait for it.
     pub(crate) fn learn(&mut self, connection: &Connection) {
         self.shorten(quic::least_rtt(connection));
+    }
+
+    /// What has become of the datagrams of either direction: it takes some to know the jitter.
+    pub(crate) fn jittered<'a>(&mut self, received: impl Iterator<Item = &'a Received>) {
+        let jitters = received.filter_map(|r| Duration::try_from_secs_f64(r.jitter_s).ok());
+        self.jitter = jitters.max().unwrap_or_default();
     }
 
     /// A path that has become shorter has no longer packets for it.
@@ -88,6 +108,7 @@ pub(crate) struct Seen {
     /// The least.
     rtt: Duration,
     answered: Duration,
+    jitter: Duration,
 }
 
 /// Why an attempt did not become a session.
@@ -115,6 +136,7 @@ struct Pace {
     apart: Duration,
     brisk: Duration,
     patient: Duration,
+    jitter: Duration,
 }
 
 impl Pace {
@@ -129,7 +151,14 @@ impl Pace {
             apart: (lengths * LENGTHS).clamp(least, SLOWEST_REDIAL),
             brisk,
             patient: brisk,
+            jitter: seen.map_or(Duration::ZERO, |seen| seen.jitter),
         }
+    }
+
+    /// How long a greeting waits for the handshake's last packet.
+    fn hold(&self, rtt: Duration) -> Duration {
+        let usual = HOLD.min(rtt / 2);
+        usual.max(self.jitter * JITTERS).min(LONGEST_HOLD)
     }
 
     fn next_patient(&mut self) -> Duration {
@@ -202,7 +231,7 @@ impl Dialler {
                 }
                 let patient = !std::mem::replace(&mut self.patient, true);
                 let within = if patient { self.pace.next_patient() } else { self.pace.brisk };
-                let attempt = attempt(self.endpoint.clone(), self.robot, self.offered, within, self.answered_tx.clone());
+                let attempt = attempt(self.endpoint.clone(), self.robot, self.offered, (within, self.pace), self.answered_tx.clone());
                 self.attempts.spawn(async move { (patient, attempt.await) });
                 None
             }
@@ -215,7 +244,7 @@ async fn attempt(
     endpoint: Endpoint,
     robot: SocketAddr,
     offered: Versions,
-    within: Duration,
+    (within, pace): (Duration, Pace),
     answered: watch::Sender<Option<Instant>>,
 ) -> Result<Link, DialError> {
     let begun = Instant::now();
@@ -229,13 +258,18 @@ async fn attempt(
     answer.map_err(silent)?.map_err(|e| failed(&e))?;
     let now = Instant::now();
     answered.send_replace(Some(now));
-    let rest = timeout(LONGEST_ATTEMPT, connect(connecting, offered, now - begun)).await;
+    let rest = timeout(
+        LONGEST_ATTEMPT,
+        connect(connecting, offered, pace, now - begun),
+    )
+    .await;
     rest.map_err(silent)?
 }
 
 async fn connect(
     connecting: Connecting,
     offered: Versions,
+    pace: Pace,
     answered: Duration,
 ) -> Result<Link, DialError> {
     let connection = connecting.await.map_err(|e| failed(&e))?;
@@ -246,16 +280,21 @@ async fn connect(
             .close_reason()
             .map_or_else(|| DialError::Again(e.to_string()), |lost| failed(&lost)),
     };
+    sleep(pace.hold(connection.rtt())).await;
     let mut control = Control::open(&connection).await.map_err(again)?;
     let hello = offered.hello().encode();
     control.write(&hello).await.map_err(again)?;
-    let answer = match timeout(NUDGE, control.answer()).await {
-        Ok(answer) => answer,
-        Err(_) => {
+    let mut answer = timeout(NUDGE, control.answer()).await;
+    for _ in 0..NUDGES {
+        if answer.is_err() {
             let nothing = frame::encode(&[], true);
             control.write(&nothing).await.map_err(again)?;
-            control.answer().await
+            answer = timeout(NUDGE, control.answer()).await;
         }
+    }
+    let answer = match answer {
+        Ok(answer) => answer,
+        Err(_) => control.answer().await,
     };
     match answer.map_err(again)? {
         Answer::Ack { version, epoch, .. } => {
@@ -311,6 +350,7 @@ mod tests {
             let seen = |rtt| Seen {
                 rtt: ms(rtt),
                 answered: ms(rtt + 20),
+                jitter: Duration::ZERO,
             };
             let mut pace = Pace::new(rtt.map(seen));
             let apart = rtt.map_or(FIRST_REDIAL, |_| REDIAL);
@@ -326,12 +366,37 @@ mod tests {
     }
 
     #[test]
+    fn a_greeting_waits_for_as_long_as_packets_are_apart() {
+        let ms = Duration::from_millis;
+        for (jitter, rtt, hold) in [
+            (0, 100, 20),
+            (0, 2, 1),
+            (3, 100, 20),
+            (10, 100, 40),
+            (90, 100, 100),
+        ] {
+            let seen = Seen {
+                rtt: ms(rtt),
+                answered: ms(rtt),
+                jitter: ms(jitter),
+            };
+            assert_eq!(
+                Pace::new(Some(seen)).hold(ms(rtt)),
+                ms(hold),
+                "{jitter}, {rtt}"
+            );
+        }
+        assert_eq!(Pace::new(None).hold(ms(100)), HOLD);
+    }
+
+    #[test]
     fn on_a_thin_link_attempts_are_farther_apart() {
         let ms = Duration::from_millis;
         for (answered, apart) in [(180, 250), (300, 600), (3_000, 2_000)] {
             let seen = Seen {
                 rtt: ms(100),
                 answered: ms(answered),
+                jitter: Duration::ZERO,
             };
             assert_eq!(Pace::new(Some(seen)).apart, ms(apart));
             let mut shorter = seen;
