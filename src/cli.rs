@@ -236,7 +236,7 @@ pub fn main() -> ExitCode {
             eprintln!("telemime: {}", one_line(e.chain()));
             match e.downcast_ref::<experiment::Missing>() {
                 Some(_) => ExitCode::from(experiment::Missing::EXIT),
-                None => ExitCode::FAILURE,
+                None => telemime_endpoint::cli::failure(&e),
             }
         }
     }

@@ -21,7 +21,7 @@ use anyhow::{Context, bail};
 use nalgebra::UnitQuaternion;
 use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
-use telemime_endpoint::config::{self, Layers, Settings};
+use telemime_endpoint::config::{self, Settings};
 use telemime_endpoint::peers::{Peers, Role, Source, Whom};
 use telemime_endpoint::recording::To;
 use telemime_endpoint::supervisor::Supervisor;
@@ -57,9 +57,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     if args.print_schema {
         return cli::say(&serde_json::to_string_pretty(&config::schema::<Args>())?);
     }
-    let below = Layers::read::<Args>(args.config.as_deref(), &config::environment()).table()?;
-    let args = args.clone().over(below)?;
-    args.judge()?;
+    let args = args.settled(args.config.as_deref())?;
     if args.input.input == Some(crate::input::Source::Evdev(None)) {
         return input::list_devices(args.json);
     }

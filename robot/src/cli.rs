@@ -13,7 +13,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
-use telemime_endpoint::config::{self, Layers, Settings};
+use telemime_endpoint::config::{self, Settings};
 use telemime_endpoint::pairing::Own;
 use telemime_endpoint::peers::{Role, Source, Whom};
 use telemime_endpoint::supervisor::Supervisor;
@@ -197,9 +197,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     if args.print_schema {
         return cli::say(&serde_json::to_string_pretty(&config::schema::<Args>())?);
     }
-    let below = Layers::read::<Args>(args.config.as_deref(), &config::environment()).table()?;
-    let args = args.clone().over(below)?;
-    args.judge()?;
+    let args = args.settled(args.config.as_deref())?;
     let logging = logs::start(args.log_format)?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()

@@ -376,7 +376,23 @@ fn a_configuration_is_checked_line_by_line_and_explained() {
             said.contains(&format!("{file}:{line}: ")) && said.contains(words),
             "{text}: {said}"
         );
+        let robot = telemime(&["robot", "--config", file], &[]);
+        assert_eq!(
+            robot.status.code(),
+            Some(2),
+            "{text}: {:?}",
+            self::said(&robot)
+        );
     }
+    let both = [
+        "operator",
+        "--console",
+        "127.0.0.1:0",
+        "--play",
+        "wave.skill",
+    ];
+    let both = telemime(&both, &[]);
+    assert_eq!(both.status.code(), Some(2), "{:?}", said(&both));
     // All of it at once, and what only the arm shows.
     let (code, (_, both)) = check("a = 1\nb = 2\n", &[], &[]);
     assert!(code == Some(2) && both.lines().count() == 2, "{both}");

@@ -14,6 +14,8 @@ use telemime_protocol::wire::{Version, Versions};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{mpsc, watch};
 
+use crate::config::Unusable;
+
 /// The daemons' own folder: `$XDG_CONFIG_HOME/telemime`, else `$HOME/.config/telemime`, else here.
 pub fn config_dir() -> PathBuf {
     let set = |name: &str| {
@@ -27,15 +29,24 @@ pub fn config_dir() -> PathBuf {
         .join("telemime")
 }
 
-/// What a program ends with: 0, 1 (failed, with one line on stderr) or 2 (a configuration that cannot be, which has been said).
+/// What a program ends with: 0, 1 (failed, with one line on stderr) or 2 (a configuration that cannot be; `Ok(false)` has said so).
 pub fn exit_code(program: &str, done: &anyhow::Result<bool>) -> ExitCode {
     match done {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::from(2),
         Err(e) => {
             eprintln!("{program}: {}", one_line(e.chain()));
-            ExitCode::FAILURE
+            failure(e)
         }
+    }
+}
+
+/// 2 if what was set cannot be, and 1 else.
+pub fn failure(error: &anyhow::Error) -> ExitCode {
+    if error.is::<Unusable>() {
+        ExitCode::from(2)
+    } else {
+        ExitCode::FAILURE
     }
 }
 

@@ -109,7 +109,7 @@ fn by_delay(view: &View<'_>, (motion, words): (&str, &str)) -> Option<Chart> {
     Some(Chart {
         name,
         caption: format!(
-            "RMS distance of tip and hand at the same moment, {words}, over the link's one-way delay. Bands: 95 % bootstrap over people; links of one delay are pooled."
+            "RMS distance of tip and hand at the same moment, {words}, over the link's one-way delay. Bands: 95 % bootstrap over people and their recordings; links of one delay are pooled."
         ),
         panel: panel(
             &format!("Error against delay: {words}"),

@@ -206,7 +206,7 @@ const COLUMNS: [(&str, &str, f64, usize); 16] = [
 
 fn tables(view: &View<'_>) -> String {
     let mut out = String::from(
-        "<section>\n<h2>Every setting</h2>\n<p>Means over people and link seeds, with 95 % intervals of a bootstrap over people. <em>Hidden</em> is (E<sub>held</sub> − E)/(E<sub>held</sub> − E<sub>floor</sub>), run by run.</p>\n",
+        "<section>\n<h2>Every setting</h2>\n<p>Means over people and link seeds, with 95 % intervals of a bootstrap over people and their recordings. <em>Hidden</em> is (E<sub>held</sub> − E)/(E<sub>held</sub> − E<sub>floor</sub>), run by run.</p>\n",
     );
     for (motion, words) in [
         ("on-model", "Demonstrated motion"),

@@ -9,11 +9,13 @@ mod layers;
 mod render;
 
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 pub use check::{CheckArgs, check};
 pub use layers::{Layers, Origin, environment};
 pub use render::{example, schema};
+
+use crate::cli::one_line;
 
 /// What a setting's value looks like.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -170,6 +172,28 @@ pub trait Settings: clap::Args + Clone + Default + fmt::Debug {
     /// # Errors
     /// One line that says what to do.
     fn rehearse(&self) -> anyhow::Result<()>;
+
+    /// These flags over what the environment sets, over what `file` does, judged.
+    ///
+    /// # Errors
+    /// All that cannot be.
+    fn settled(&self, file: Option<&Path>) -> Result<Self, Unusable> {
+        let below = Layers::read::<Self>(file, &environment()).table()?;
+        let settled = self.clone().over(below);
+        let judged = settled.and_then(|settled| settled.judge().map(|()| settled));
+        judged.map_err(|e| Unusable::Judged(one_line(e.chain())))
+    }
+}
+
+/// A daemon will not begin with what it was set to: its exit code is 2.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Unusable {
+    /// File or environment.
+    #[error(transparent)]
+    Read(#[from] ConfigError),
+    /// Values that cannot be, or not together.
+    #[error("{0}")]
+    Judged(String),
 }
 
 /// Where something wrong stands.
