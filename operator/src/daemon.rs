@@ -177,7 +177,7 @@ impl Daemon {
                 .await;
             self.ended(&session);
             let of_link = session.seen();
-            last.jittered(of_link.up.iter().chain([&of_link.down]));
+            last.jittered(of_link.up.as_ref(), &of_link.down);
             seen = Some(last);
             stop = session.stop_is_unconfirmed();
             summary.counters.add(session.counters());

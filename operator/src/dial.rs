@@ -89,10 +89,11 @@ impl Seen {
         self.shorten(quic::least_rtt(connection));
     }
 
-    /// What has become of the datagrams of either direction: it takes some to know the jitter.
-    pub(crate) fn jittered<'a>(&mut self, received: impl Iterator<Item = &'a Received>) {
-        let jitters = received.filter_map(|r| Duration::try_from_secs_f64(r.jitter_s).ok());
-        self.jitter = jitters.max().unwrap_or_default();
+    /// What has become of the datagrams each way. A hand out of sight ages, and a clock that is set moves: only what both
+    /// directions show is the link's.
+    pub(crate) fn jittered(&mut self, up: Option<&Received>, down: &Received) {
+        let least_s = up.map_or(0.0, |up| up.jitter_s.min(down.jitter_s));
+        self.jitter = Duration::try_from_secs_f64(least_s).unwrap_or_default();
     }
 
     /// A path that has become shorter has no longer packets for it.
