@@ -3,14 +3,15 @@
 //! Call order: any `handle_*`, then [`Session::poll_output`] until it is empty, then [`Session::poll_timeout`]
 //! for when to call [`Session::handle_timeout`].
 
+mod grant;
 mod motion;
+mod tell;
 #[cfg(test)]
 mod tests;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use nalgebra::{Quaternion, UnitQuaternion};
 use telemime_endpoint::reception::{Quantiles, Received, Reception, Spread};
 use telemime_endpoint::tally::Tally;
 use telemime_endpoint::{Mono, Pacer};
@@ -20,18 +21,16 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::arm::WireArm;
 use telemime_protocol::wire::codec;
 use telemime_protocol::wire::frame::Frame;
-use telemime_protocol::wire::turn::{WireRotation, dequantise_grip, quantise_grip};
 use telemime_protocol::wire::v1::{
-    self, Cause, Drive, Engage, ExternalClock, Info, MAX_PLAN_LEN, Message, ModelId,
-    OperatorControl, OperatorDatagram, Refusal, RobotControl, RobotDatagram, RobotState,
-    ServoTimes, Telemetry,
+    Cause, ExternalClock, Info, MAX_PLAN_LEN, Message, OperatorControl, OperatorDatagram, Refusal,
+    RobotControl, RobotDatagram, RobotState,
 };
 use telemime_protocol::wire::{DecodeError, Version, Versions};
 
 use crate::clock::{SessionClock, Slew};
 use crate::safety::SafetyConfig;
 use crate::servo::thread::Times;
-use crate::servo::{self, Engagement, Order, Report, Source, Ticket, Trajectory};
+use crate::servo::{Order, Report};
 use motion::Mirror;
 
 /// Pings in quick succession at the start, so that the clock is known before the first engage.
@@ -384,50 +383,6 @@ impl Session {
         }
     }
 
-    /// The servo's report of a tick.
-    pub fn handle_report(&mut self, report: &Report, timing: Times) {
-        self.timing = timing;
-        let changed = self.transitions != Some(report.transitions);
-        self.transitions = Some(report.transitions);
-        self.report = Some(*report);
-        if std::mem::take(&mut self.owed) {
-            self.order(Order::Operator(true));
-        }
-        let follows = matches!(report.state, RobotState::Engaged | RobotState::Coasting);
-        if follows && self.mirror.is_some() {
-            self.ages.add(report.age_s);
-        }
-        let pending = self.acknowledged != self.engagement;
-        if pending && report.engagement == self.ticket() {
-            self.acknowledged = self.engagement;
-            let t_us = self
-                .clock
-                .to_session(report.engaged_at)
-                .map_or(0, |t| t.0 / 1000);
-            self.send(&RobotControl::Engaged {
-                engagement: self.engagement,
-                t_us,
-                hand_m: report.mapping.hand_m.cast::<f32>().into(),
-                tip_m: report.mapping.tip_m.cast::<f32>().into(),
-                hand_q: report
-                    .mapping
-                    .hand_orientation
-                    .map(|q| WireRotation::quantise(&q)),
-                tip_q: WireRotation::quantise(&report.mapping.tip_orientation),
-            });
-        } else if pending && report.declined == self.ticket() {
-            self.acknowledged = self.engagement;
-            self.mirror = None;
-            self.refuse(match report.state {
-                RobotState::Stopped => Refusal::Stopped,
-                _ => Refusal::Moving,
-            });
-        }
-        if changed {
-            self.send_state(report);
-        }
-    }
-
     /// Something is due.
     pub fn handle_timeout(&mut self, now: Mono) {
         if now >= self.next_ping {
@@ -461,20 +416,6 @@ impl Session {
         self.order(Order::Operator(false));
     }
 
-    /// An order that [`poll_output`](Self::poll_output) gave found no place on its way to the servo, and the brake was pulled for it.
-    pub fn handle_lost(&mut self, order: &Order) {
-        match order {
-            // It is nowhere: no report will ever acknowledge or decline it.
-            Order::Engage(engagement) if engagement.ticket == self.ticket() => {
-                self.acknowledged = self.engagement;
-                self.mirror = None;
-                self.refuse(Refusal::Moving);
-            }
-            Order::Operator(true) => self.owed = true,
-            _ => {}
-        }
-    }
-
     /// What to do next.
     pub fn poll_output(&mut self) -> Option<Output> {
         self.outputs.pop_front()
@@ -489,115 +430,6 @@ impl Session {
         }
     }
 
-    fn store_model(&mut self, now: Mono, id: ModelId, bytes: &[u8]) {
-        match Skill::from_bytes(bytes) {
-            Ok(skill) if skill.id().0 == id => {
-                // What is being followed goes on with the model it began with: another one would be a jump.
-                let skill = Some(Arc::new(skill));
-                if self.is_following() {
-                    self.next_skill = skill;
-                } else {
-                    (self.skill, self.next_skill) = (skill, None);
-                }
-                self.send(&RobotControl::ModelStored { id });
-                // What was asked meanwhile waited behind the model: ask again before anybody engages by the answers.
-                (self.pings, self.next_ping) = (0, now);
-            }
-            _ => self.refuse(Refusal::BadModel),
-        }
-    }
-
-    /// Something is followed, or was granted a moment ago.
-    fn is_following(&self) -> bool {
-        let state = self.report.map(|r| r.state);
-        self.acknowledged != self.engagement
-            || matches!(state, Some(RobotState::Engaged | RobotState::Coasting))
-    }
-
-    fn engage(&mut self, now: Mono, engage: &Engage) -> Result<(), Refusal> {
-        let report = self.report.as_ref().ok_or(Refusal::Moving)?;
-        match report.state {
-            RobotState::Stopped => return Err(Refusal::Stopped),
-            RobotState::Engaged | RobotState::Coasting => return Err(Refusal::AlreadyEngaged),
-            RobotState::Idle | RobotState::Ready | RobotState::Holding => {}
-        }
-        if report.moving {
-            return Err(Refusal::Moving);
-        }
-        if engage.engagement <= self.engagement {
-            return Err(Refusal::OldEngagement);
-        }
-        // What was granted a moment ago is not in a report yet.
-        if self.acknowledged != self.engagement {
-            return Err(Refusal::AlreadyEngaged);
-        }
-        if let Some(next) = self.next_skill.take() {
-            self.skill = Some(next);
-        }
-        let [w, x, y, z] = engage.rotation.map(f64::from);
-        let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
-        // From here on an estimate may be applied at once: nothing is being followed.
-        self.clock.slew(now, false);
-        let asked = Stamp(engage.t_us.saturating_mul(1000));
-        let asked_at = self.clock.to_mono(asked).ok_or(Refusal::ClockUnknown)?;
-        let age_s = now.secs_since(asked_at);
-        if age_s.abs() > self.config.max_delay_s {
-            return Err(Refusal::StaleReference);
-        }
-        let late_s = age_s.max(0.0);
-        let (source, mirror) = match &engage.drive {
-            Drive::Mirror {
-                state,
-                model,
-                params,
-                pose,
-            } => {
-                let mirror = Mirror::new(engage).ok_or(Refusal::BadMapping)?;
-                let state = state.dequantise();
-                let valid_at = self.clock.to_mono(state.t).ok_or(Refusal::ClockUnknown)?;
-                let age_s = now.secs_since(valid_at);
-                if !(-self.config.max_delay_s..=self.config.max_delay_s).contains(&age_s) {
-                    return Err(Refusal::StaleReference);
-                }
-                let forecast = self.forecast(&state, *model, &params.dequantise());
-                let source = Source::Mirror {
-                    forecast,
-                    valid_at,
-                    turn: self.turn_forecast(state.t, *model, pose.turn.as_ref()),
-                    grip: pose.grip.map(dequantise_grip),
-                };
-                (source, Some(mirror))
-            }
-            Drive::Play { plan } => {
-                let (_, held) = self
-                    .plan
-                    .as_ref()
-                    .filter(|(id, _)| id == plan)
-                    .ok_or(Refusal::BadPlan)?;
-                let curve = held.curve().map_err(|_| Refusal::BadPlan)?;
-                let (start_s, duration_s) = curve.position.span_s();
-                if start_s != 0.0 {
-                    return Err(Refusal::BadPlan);
-                }
-                (
-                    Source::Play(Arc::new(Trajectory { curve, duration_s })),
-                    None,
-                )
-            }
-        };
-        self.engagement = engage.engagement;
-        self.mirror = mirror;
-        self.order(Order::Engage(Engagement {
-            ticket: self.ticket(),
-            model: self.skill.as_ref().map(|skill| skill.id().0),
-            source,
-            scale: f64::from(engage.scale),
-            rotation,
-            lease: self.lease(now, engage.lease_ms, late_s),
-        }));
-        Ok(())
-    }
-
     fn follow_clock(&mut self, now: Mono) {
         let following = self
             .report
@@ -605,115 +437,6 @@ impl Session {
         if self.clock.slew(now, following) == Slew::Step {
             self.brake(Cause::ClockStep);
         }
-    }
-
-    /// What the operator is told of its motions.
-    fn told(&self) -> v1::Reception {
-        let us = |s: f64| (s * 1e6).round().clamp(0.0, f64::from(u32::MAX)) as u32;
-        let four = |times: Option<Quantiles>| {
-            let t = times.unwrap_or_default();
-            [t.mean_s, t.p50_s, t.p95_s, t.max_s].map(us)
-        };
-        let Seen { up, age, .. } = self.seen();
-        v1::Reception {
-            epoch: self.epoch,
-            newest_seq: self.reception.newest(),
-            received: up.received,
-            duplicates: up.duplicates,
-            reordered: up.reordered,
-            loss_runs: up.loss_runs,
-            longest_loss_run: up.longest_loss_run,
-            jitter_us: us(up.jitter_s),
-            delay_us: four(up.delay),
-            age_us: four(age),
-        }
-    }
-
-    fn servo_times(&self) -> ServoTimes {
-        let four = |q: servo::Quantiles| [q.p50_ns, q.p99_ns, q.p999_ns, q.max_ns];
-        let Times {
-            ticks,
-            mean_ns,
-            work,
-            wake,
-            overruns,
-        } = self.timing;
-        ServoTimes {
-            epoch: self.epoch,
-            ticks,
-            overruns,
-            mean_ns,
-            work_ns: four(work),
-            wake_ns: four(wake),
-        }
-    }
-
-    fn telemetry(&mut self, now: Mono) -> Option<Telemetry> {
-        let report = self.report?;
-        self.telemetry_seq += 1;
-        let milliseconds = |s: f64| (s * 1e3).round().clamp(0.0, f64::from(u16::MAX)) as u16;
-        let uncertainty_us = self
-            .clock
-            .uncertainty_s(now)
-            .map_or(f64::from(u32::MAX), |s| s * 1e6);
-        Some(Telemetry {
-            epoch: self.epoch,
-            seq: self.telemetry_seq,
-            state: report.state,
-            engagement: if report.engagement.epoch == self.epoch {
-                report.engagement.number
-            } else {
-                0
-            },
-            t_us: self.clock.to_session(report.at).map_or(0, |t| t.0 / 1000),
-            clock_uncertainty_us: uncertainty_us as u32,
-            age_ms: milliseconds(report.age_s),
-            // 0 is for what is not known: a delay that cannot be told from none is the least there is.
-            delay_ms: self.delay_s.map_or(0, |s| milliseconds(s).max(1)),
-            path_frontier: self.mirror.as_ref().map_or(0, Mirror::frontier),
-            received: self.reception.received(),
-            newest_seq: self.reception.newest(),
-            dropped: self.dropped,
-            clamps: report.clamps,
-            tip_m: report.tip_m.cast::<f32>().into(),
-            tip_q: WireRotation::quantise(&report.orientation),
-            grip: report.opening.map(quantise_grip),
-            q: report
-                .q
-                .iter()
-                .take(usize::from(self.info.joints))
-                .map(|&v| v as f32)
-                .collect(),
-        })
-    }
-
-    /// Only those who know of a stop may leave it, and one made at the robot is left at the robot.
-    fn reset(&mut self, changes: u32) {
-        let Some(report) = self.report.filter(|r| r.state == RobotState::Stopped) else {
-            return;
-        };
-        if report.cause != Cause::OperatorStop || report.transitions != changes {
-            return self.refuse(Refusal::NotYours);
-        }
-        self.order(Order::Reset {
-            operator: true,
-            stop: Some(changes),
-        });
-    }
-
-    fn ticket(&self) -> Ticket {
-        Ticket {
-            epoch: self.epoch,
-            number: self.engagement,
-        }
-    }
-
-    fn send_state(&mut self, report: &Report) {
-        self.send(&RobotControl::State {
-            state: report.state,
-            cause: report.cause,
-            changes: report.transitions,
-        });
     }
 
     fn refuse(&mut self, reason: Refusal) {

@@ -8,13 +8,13 @@ use telemime_protocol::predict::{HandState, Params};
 use telemime_protocol::skill::{Skill, example};
 use telemime_protocol::wire::knots::{KnotBlock, PathCode};
 use telemime_protocol::wire::state::WireState;
-use telemime_protocol::wire::turn::WirePose;
-use telemime_protocol::wire::v1::{Motion, WireParams};
+use telemime_protocol::wire::turn::{WirePose, WireRotation};
+use telemime_protocol::wire::v1::{Drive, Engage, Motion, ServoTimes, WireParams};
 use telemime_sim::arm::Joints;
 
 use super::*;
 use crate::servo::thread::Times;
-use crate::servo::{Mapping, Quantiles};
+use crate::servo::{Engagement, Mapping, Quantiles, Source, Ticket};
 
 mod control;
 mod datagrams;
