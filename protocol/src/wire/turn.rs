@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::codec::DecodeError;
 use super::memory::WireMemory;
 use super::v1::WireParams;
+use crate::checkpoint::bits::{BitReader, BitWriter};
 use crate::pose;
 use crate::predict::{TurnForecast, TurnState};
 use crate::skill::Skill;
@@ -20,8 +21,8 @@ const HALF_TURN: i16 = 31_416;
 /// Finest step of a memory, rad.
 const MEMORY_STEP_RAD: f64 = 2.5e-5;
 
-/// 127 steps of it are more than π.
-const MAX_EXPONENT: u8 = 10;
+/// The sender's 63 steps of it are more than π.
+const MAX_EXPONENT: u8 = 11;
 
 /// An orientation as its rotation vector, in steps of 0.1 mrad; of length at most π.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -79,6 +80,28 @@ impl WireTurn {
         }
     }
 
+    /// As bits.
+    pub(super) fn write(&self, w: &mut BitWriter) {
+        for n in self.q.0 {
+            w.put(u64::from(n.cast_unsigned()), 16);
+        }
+        self.memory.write(w);
+        self.params.write(w);
+    }
+
+    /// What [`WireTurn::write`] wrote.
+    pub(super) fn read(r: &mut BitReader<'_>) -> Option<Self> {
+        let mut q = WireRotation::default();
+        for n in &mut q.0 {
+            *n = (r.take(16)? as u16).cast_signed();
+        }
+        Some(Self {
+            q,
+            memory: WireMemory::read(r)?,
+            params: WireParams::read(r)?,
+        })
+    }
+
     /// The state both ends predict from; `t` is that of the hand state it came with.
     pub fn dequantise(&self, t: Stamp) -> TurnState {
         let q = self.q.dequantise();
@@ -115,7 +138,7 @@ impl WirePose {
         if turn.memory.exponents().iter().any(|e| *e > MAX_EXPONENT) {
             return Err(DecodeError::Invalid {
                 field: "pose.memory",
-                why: "above 10",
+                why: "above 11",
             });
         }
         turn.params.check("pose.params")?;
@@ -156,7 +179,7 @@ mod tests {
             memory in prop::array::uniform4(rotation()),
         ) {
             let state = TurnState { t: Stamp(7), q, memory };
-            let params = WireParams { gain: 255, inflation: 128, weights: [[100, 0, 155]; 3] };
+            let params = WireParams { gain: 255, inflation: 128, weights: [[6, 0, 9]; 3] };
             let wire = WireTurn::quantise(&state, params);
             let pose = WirePose { turn: Some(wire), grip: None };
             prop_assert!(pose.check().is_ok());
@@ -200,11 +223,11 @@ mod tests {
             }),
             grip: None,
         };
-        assert!(turn([31_416, -31_416, 0], 10).check().is_ok());
+        assert!(turn([31_416, -31_416, 0], 11).check().is_ok());
         assert!(turn([31_417, 0, 0], 0).check().is_err());
         assert!(turn([i16::MIN, 0, 0], 0).check().is_err());
-        assert!(turn([0; 3], 0xaa).check().is_ok());
-        assert!(turn([0; 3], 11).check().is_err());
-        assert!(turn([0; 3], 0xb0).check().is_err());
+        assert!(turn([0; 3], 0xbb).check().is_ok());
+        assert!(turn([0; 3], 12).check().is_err());
+        assert!(turn([0; 3], 0xc0).check().is_err());
     }
 }
