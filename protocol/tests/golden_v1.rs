@@ -271,18 +271,17 @@ fn operator_datagrams() {
     pinned(vec![
         (
             motion(Some(0xdead_beef), WirePose::default(), knots),
-            "000103fc70110100fb8a02fb1032ff900c020109040206050201fcefbeaddefc14ad2500fbd007fb8713fb50c3123f01ff \
-             02fe03fd28ce3c7f80000000fa045a00c3fe",
+            "c89b00893820990864308650994b7ab6fbbc000f120a3e85387206a02d866a72d0f1706f08604181058fd05a00c3fe \
+             ",
         ),
         (
             motion(None, WirePose::default(), KnotBlock::default()),
-            "000103fc70110100fb8a02fb1032ff900c020109040206050200fc14ad2500fbd007fb8713fb50c3123f01ff02fe03fd28 \
-             ce3c7f80000000fa00",
+            "409b008938209908643086509948000f120a3e85387206a02d866a72d0f1706f086041810580",
         ),
         (
             motion(None, POSE, KnotBlock::default()),
-            "000103fc70110100fb8a02fb1032ff900c020109040206050200fc14ad2500fbd007fb8713fb50c3123f01ff02fe03fd28 \
-             ce3c7f800001fb204efb6ff500140a010203fffefd7f8000050607ff900c02010904020605020164fa00",
+            "709b008938209908643086509948000f120a3e85387206a02d866a72d0f1706f0860418105827108548000013880ad67 \
+             4de826c14e13092cb643086509949900",
         ),
         (go(None), "010103fbfb00fc0ead2500fb8a0200"),
         (

@@ -39,15 +39,15 @@ const STATE: WireState = WireState {
     t_us: 3_000_000,
     x: [4_000, -2_000, 25_000],
     memory: WireMemory {
-        exponents: [0x23, 0x45],
-        offsets: [[80, -32, 0], [96, -36, 4], [100, -40, 4], [80, -30, 5]],
+        exponents: [0x34, 0x56],
+        offsets: [[40, -16, 0], [48, -18, 2], [50, -20, 2], [40, -15, 3]],
     },
 };
 
 const PARAMS: WireParams = WireParams {
     gain: 255,
     inflation: 136,
-    weights: [[230, 10, 10], [180, 40, 30], [128, 60, 50]],
+    weights: [[13, 1, 1], [11, 2, 2], [8, 4, 3]],
 };
 
 const TURN: WireTurn = WireTurn {
@@ -59,7 +59,7 @@ const TURN: WireTurn = WireTurn {
     params: WireParams {
         gain: 255,
         inflation: 128,
-        weights: [[0, 0, 200]; 3],
+        weights: [[0, 0, 12]; 3],
     },
 };
 
