@@ -6,7 +6,7 @@ import document
 from telemime import (
     bend, codec, frames, greeting, lease, messages, pairing, path, plan, predict, rotation, skill, spline, state)  # fmt: skip
 
-STATE = bytes.fromhex("fc808d5b00 fb401ffb9f0ffb50c3 3456 28f00030ee0232ec0228f103")
+STATE = bytes.fromhex("fc808d5b00 fb401ffb9f0ffb50c3 2345 50e00060dc0464d80450e205")
 PARAMS = {"gain": 255, "inflation": 136, "weights": [[13, 1, 1], [11, 2, 2], [8, 4, 3]]}
 
 
@@ -59,8 +59,8 @@ class Document(unittest.TestCase):
         self.assertEqual((m["epoch"], m["engagement"], m["seq"], m["lease_ms"]), (7, 1, 42, 650))
         self.assertEqual(m["state"]["x"], [4000, -2000, 25000])
         memory = m["state"]["memory"]
-        self.assertEqual(state.exponents(memory), [3, 4, 5, 6])
-        self.assertEqual(memory["offsets"], [[40, -16, 0], [48, -18, 2], [50, -20, 2], [40, -15, 3]])
+        self.assertEqual(state.exponents(memory), [2, 3, 4, 5])
+        self.assertEqual(memory["offsets"], [[80, -32, 0], [96, -36, 4], [100, -40, 4], [80, -30, 5]])
         t = messages.read("robot datagram", document.example("telemetry"))["Telemetry"]
         self.assertEqual((t["seq"], t["state"], t["t_us"], t["age_ms"], t["grip"]), (300, "Engaged", 3_100_000, 180, 255))
         self.assertEqual(t["q"], [0.0, 1.0])

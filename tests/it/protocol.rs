@@ -39,8 +39,8 @@ const STATE: WireState = WireState {
     t_us: 3_000_000,
     x: [4_000, -2_000, 25_000],
     memory: WireMemory {
-        exponents: [0x34, 0x56],
-        offsets: [[40, -16, 0], [48, -18, 2], [50, -20, 2], [40, -15, 3]],
+        exponents: [0x23, 0x45],
+        offsets: [[80, -32, 0], [96, -36, 4], [100, -40, 4], [80, -30, 5]],
     },
 };
 

@@ -8,12 +8,8 @@ use crate::checkpoint::bits::{BitReader, BitWriter};
 /// The largest exponent that half a byte holds.
 const MAX_EXPONENT: u8 = 15;
 
-/// The sender's steps are no finer than it takes for a vector to be within so many of them: what a memory says to a hundredth
-/// of itself it says well enough, and each bit more of it is a byte and a half.
-const MOST_STEPS: f64 = 63.0;
-
 /// Order of the codes of a component's difference to what is expected of it.
-const OFFSET_ORDER: u32 = 3;
+const OFFSET_ORDER: u32 = 4;
 
 /// Four vectors in bytes, each with a power-of-two step of its own: what happened in the last moments is small and says how fast
 /// the hand is now, what happened before is large, and neither is to be rounded as coarsely as the other needs.
@@ -31,12 +27,12 @@ impl WireMemory {
         let mut wire = Self::default();
         for (i, vector) in vectors.iter().enumerate() {
             let (mut exponent, mut step) = (0_u8, unit);
-            while vector.amax() > MOST_STEPS * step && exponent < MAX_EXPONENT {
+            while vector.amax() > 127.0 * step {
+                if exponent == MAX_EXPONENT {
+                    return None;
+                }
                 exponent += 1;
                 step *= 2.0;
-            }
-            if vector.amax() > f64::from(i8::MAX) * step {
-                return None;
             }
             wire.exponents[i / 2] |= if i % 2 == 0 { exponent << 4 } else { exponent };
             wire.offsets[i] = vector.map(|v| (v / step).round() as i8).into();

@@ -24,24 +24,11 @@ pub struct WireParams {
 impl WireParams {
     /// The nearest parameters that can travel.
     pub fn quantise(params: &Params) -> Self {
-        let step = |v: f64| (v * f64::from(WHOLE)).round() as u8;
         let octaves = libm::log2(params.inflation) * 8.0 + 128.0;
         Self {
             gain: (params.gain * 255.0).round() as u8,
             inflation: octaves.round() as u8,
-            weights: params.weights.map(|band| {
-                let mut steps = band.map(step);
-                // Rounded up together they may say more than all.
-                let over = steps
-                    .iter()
-                    .map(|&n| u16::from(n))
-                    .sum::<u16>()
-                    .saturating_sub(WHOLE.into());
-                if let Some(largest) = steps.iter_mut().max() {
-                    *largest = largest.saturating_sub(u8::try_from(over).unwrap_or(u8::MAX));
-                }
-                steps
-            }),
+            weights: params.weights.map(steps),
         }
     }
 
@@ -96,4 +83,26 @@ impl WireParams {
             })
         }
     }
+}
+
+/// Weights in steps. What is left to holding is rounded first, and the rest goes to the others: they say much the same of a hand
+/// that moves on, and holding something else.
+fn steps(band: [f64; WEIGHTED]) -> [u8; WEIGHTED] {
+    let (whole, sum) = (f64::from(WHOLE), band.iter().sum::<f64>());
+    let all = whole - (whole * (1.0 - sum).max(0.0)).round();
+    if !(all > 0.0) {
+        return [0; WEIGHTED];
+    }
+    let wanted = band.map(|weight| weight * all / sum);
+    let mut steps = wanted.map(|n| n as u8);
+    for _ in 0..WEIGHTED {
+        let short = (0..WEIGHTED).map(|i| (wanted[i] - f64::from(steps[i]), i));
+        let given: f64 = steps.iter().map(|n| f64::from(*n)).sum();
+        if given < all
+            && let Some((_, i)) = short.max_by(|a, b| a.0.total_cmp(&b.0))
+        {
+            steps[i] += 1;
+        }
+    }
+    steps
 }

@@ -21,8 +21,8 @@ const HALF_TURN: i16 = 31_416;
 /// Finest step of a memory, rad.
 const MEMORY_STEP_RAD: f64 = 2.5e-5;
 
-/// The sender's 63 steps of it are more than π.
-const MAX_EXPONENT: u8 = 11;
+/// 127 steps of it are more than π.
+const MAX_EXPONENT: u8 = 10;
 
 /// An orientation as its rotation vector, in steps of 0.1 mrad; of length at most π.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -138,7 +138,7 @@ impl WirePose {
         if turn.memory.exponents().iter().any(|e| *e > MAX_EXPONENT) {
             return Err(DecodeError::Invalid {
                 field: "pose.memory",
-                why: "above 11",
+                why: "above 10",
             });
         }
         turn.params.check("pose.params")?;
@@ -223,11 +223,11 @@ mod tests {
             }),
             grip: None,
         };
-        assert!(turn([31_416, -31_416, 0], 11).check().is_ok());
+        assert!(turn([31_416, -31_416, 0], 10).check().is_ok());
         assert!(turn([31_417, 0, 0], 0).check().is_err());
         assert!(turn([i16::MIN, 0, 0], 0).check().is_err());
-        assert!(turn([0; 3], 0xbb).check().is_ok());
-        assert!(turn([0; 3], 12).check().is_err());
-        assert!(turn([0; 3], 0xc0).check().is_err());
+        assert!(turn([0; 3], 0xaa).check().is_ok());
+        assert!(turn([0; 3], 11).check().is_err());
+        assert!(turn([0; 3], 0xb0).check().is_err());
     }
 }

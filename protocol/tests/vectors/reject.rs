@@ -410,7 +410,7 @@ fn written(change: fn(&mut [(&'static str, String)])) -> Vec<u8> {
         ("exponents", "0000111"),
         (
             "offsets",
-            "100010001000100010001000100010001000100010001000",
+            "100001000010000100001000010000100001000010000100001000010000",
         ),
         ("rest", ""),
     ]
@@ -491,7 +491,7 @@ fn motions(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
         ),
         (
             "a step beyond a byte",
-            |f| f[12].1.replace_range(0..4, "00000100001000"),
+            |f| f[12].1.replace_range(0..5, "0000100010000"),
             "Malformed",
         ),
         (
@@ -564,8 +564,8 @@ fn datagrams(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
     );
     say(
         OPERATOR_DATAGRAM,
-        "a turn's exponent of 12",
-        sent(|m| m.pose.turn.as_mut().expect("it turns").memory.exponents[1] = 0x1c),
+        "a turn's exponent of 11",
+        sent(|m| m.pose.turn.as_mut().expect("it turns").memory.exponents[1] = 0x1b),
         "Invalid",
     );
     say(

@@ -20,7 +20,7 @@ def _rotation_range(name):
 
 def _turn_ranges(s):
     _rotation_range("q")(s)
-    require(all(e <= 11 for e in exponents(s["memory"])), "memory", s["memory"])
+    require(all(e <= 10 for e in exponents(s["memory"])), "memory", s["memory"])
 
 
 def _weights(p):
@@ -72,7 +72,7 @@ def write_memory(b, memory):
         b.signed(this - last, 0)
     for i, row in enumerate(memory["offsets"]):
         for axis, n in enumerate(row):
-            b.signed(n - expected(memory["offsets"], e, i, axis), 3)
+            b.signed(n - expected(memory["offsets"], e, i, axis), 4)
 
 
 def read_memory(b):
@@ -83,7 +83,7 @@ def read_memory(b):
     for i in range(4):
         offsets.append([])
         for axis in range(3):
-            offsets[i].append(_within("memory", expected(offsets, e, i, axis) + b.signed(3), -128, 127))
+            offsets[i].append(_within("memory", expected(offsets, e, i, axis) + b.signed(4), -128, 127))
     return {"exponents": [e[0] << 4 | e[1], e[2] << 4 | e[3]], "offsets": offsets}
 
 
@@ -139,7 +139,7 @@ class Hand:
         steps, rows = [], []
         for m in self.m:
             way = [a - b for a, b in zip(self.x, m)]
-            steps.append(next(e for e in range(16) if max(map(abs, way)) <= 63 * MEMORY * 2.0**e))
+            steps.append(next(e for e in range(16) if max(map(abs, way)) <= 127 * MEMORY * 2.0**e))
             rows.append([round_away(d / (MEMORY * 2.0 ** steps[-1])) for d in way])
         packed = [steps[0] << 4 | steps[1], steps[2] << 4 | steps[3]]
         return {"t_us": 10 * round_away(self.t * 1e5), "x": x, "memory": {"exponents": packed, "offsets": rows}}

@@ -49,10 +49,7 @@ fn trust(watched: usize) -> (Trust, Vec<(f64, Trust)>) {
 #[test]
 fn a_hand_seen_to_rest_begins_nothing_and_one_not_seen_before_may_be_about_to() {
     let (asked, said) = trust(1);
-    assert!(
-        asked.iter().all(|w| *w > 7),
-        "nothing is known: {asked:?}"
-    );
+    assert!(asked.iter().all(|w| *w > 7), "nothing is known: {asked:?}");
     assert!(said.len() > 20, "{}", said.len());
     for (since_s, weights) in &said {
         let most = match since_s {
@@ -70,10 +67,7 @@ fn a_hand_seen_to_rest_begins_nothing_and_one_not_seen_before_may_be_about_to() 
         "seen for a second: {asked:?}"
     );
     for (since_s, weights) in &said {
-        assert!(
-            weights.iter().all(|w| *w == 0),
-            "{since_s} s: {weights:?}"
-        );
+        assert!(weights.iter().all(|w| *w == 0), "{since_s} s: {weights:?}");
     }
     assert_eq!(trust(70).0, [0; 3], "seen for more than two");
 }
