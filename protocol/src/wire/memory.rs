@@ -97,6 +97,6 @@ fn expected(offsets: &[[i8; 3]; 4], exponents: [u8; 4], i: usize, axis: usize) -
     let Some(before) = i.checked_sub(1) else {
         return 0;
     };
-    let thrice = 3 * i64::from(offsets[before][axis]) << exponents[before];
+    let thrice = (3 * i64::from(offsets[before][axis])) << exponents[before];
     (thrice >> (exponents[i] + 1)).clamp(-127, 127)
 }

@@ -393,8 +393,11 @@ fn control(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
     );
 }
 
+/// The fields of a motion in order, each as its bits in words.
+type Fields = [(&'static str, String)];
+
 /// A motion of no engagement worth the name, all at its origin, but for how something in it is written.
-fn written(change: fn(&mut [(&'static str, String)])) -> Vec<u8> {
+fn written(change: fn(&mut Fields)) -> Vec<u8> {
     let mut fields = [
         ("flags", "00000"),
         ("kind", "000"),
@@ -425,7 +428,8 @@ fn written(change: fn(&mut [(&'static str, String)])) -> Vec<u8> {
 
 fn motions(say: &mut impl FnMut(&'static str, &str, Vec<u8>, &'static str)) {
     assert!(OperatorDatagram::decode(&written(|_| ())).is_ok());
-    let cases: [(_, fn(&mut [(&'static str, String)]), _); 14] = [
+    type Case = (&'static str, fn(&mut Fields), &'static str);
+    let cases: [Case; 14] = [
         (
             "other bits in the kind",
             |f| f[1].1 = "111".into(),
