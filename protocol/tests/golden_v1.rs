@@ -10,7 +10,7 @@ use telemime_protocol::wire::turn::{WirePose, WireRotation, WireTurn};
 use telemime_protocol::wire::v1::*;
 
 const STATE: WireState = WireState {
-    t_us: 1_234_567,
+    t_us: 1_234_570,
     x: [1000, -2500, 25_000],
     memory: WireMemory {
         exponents: [0x12, 0x3f],
@@ -21,7 +21,7 @@ const STATE: WireState = WireState {
 const PARAMS: WireParams = WireParams {
     gain: 255,
     inflation: 144,
-    weights: [[200, 30, 20], [150, 60, 40], [100, 80, 30]],
+    weights: [[12, 2, 1], [9, 4, 2], [6, 5, 2]],
 };
 
 const POSE: WirePose = WirePose {
@@ -95,13 +95,13 @@ fn operator_control() {
         ),
         (
             engage(mirror(WirePose::default())),
-            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28ce3c7f8000fb1032ff90c81e14963c2864501e0000 \
+            "0203fc0ead250000fc14ad2500fbd007fb8713fb50c3123f01ff02fe03fd28ce3c7f8000fb1032ff900c02010904020605020000 \
              0000003e0000003f000000bf0000003f0000003ffb204e00fb3582fb8a02",
         ),
         (
             engage(mirror(POSE)),
-            "0203fc0ead250000fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28ce3c7f8000fb1032ff90c81e14963c2864501e \
-             01fb204efb6ff500140a010203fffefd7f8000050607ff90c81e14963c2864501e0164 \
+            "0203fc0ead250000fc14ad2500fbd007fb8713fb50c3123f01ff02fe03fd28ce3c7f8000fb1032ff900c0201090402060502 \
+             01fb204efb6ff500140a010203fffefd7f8000050607ff900c02010904020605020164 \
              0000003e0000003f000000bf0000003f0000003ffb204e00fb3582fb8a02",
         ),
         (
@@ -115,7 +115,7 @@ fn operator_control() {
                 first_knot: 300,
                 knots: KnotBlock(vec![0x80, 0x7f, 0xff]),
             }),
-            "0303fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28ce3c7f8000fb2c0103807fff",
+            "0303fc14ad2500fbd007fb8713fb50c3123f01ff02fe03fd28ce3c7f8000fb2c0103807fff",
         ),
         (OperatorControl::Release { engagement: 3 }, "0403"),
         (OperatorControl::EmergencyStop, "05"),
@@ -243,7 +243,7 @@ fn robot_control() {
 
 #[test]
 fn operator_datagrams() {
-    let motion = |checksum, pose, knots| {
+    let motion = |checksum, pose, knots: KnotBlock| {
         OperatorDatagram::Motion(Motion {
             epoch: 1,
             engagement: 3,
@@ -254,7 +254,7 @@ fn operator_datagrams() {
             checksum,
             state: STATE,
             pose,
-            first_knot: 250,
+            first_knot: if knots.is_empty() { 0 } else { 250 },
             knots,
         })
     };
@@ -271,18 +271,16 @@ fn operator_datagrams() {
     pinned(vec![
         (
             motion(Some(0xdead_beef), WirePose::default(), knots),
-            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e01fcefbeaddefc0ead2500fbd007fb8713fb50c3123f01ff \
-             02fe03fd28ce3c7f80000000fa045a00c3fe",
+            "c89b00893820990864308650994b7ab6fbbc000f120a3e85387206a02d86651a4f17321dc47043821b0fd05a00c3fe",
         ),
         (
             motion(None, WirePose::default(), KnotBlock::default()),
-            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28 \
-             ce3c7f80000000fa00",
+            "409b008938209908643086509948000f120a3e85387206a02d86651a4f17321dc47043821b00",
         ),
         (
             motion(None, POSE, KnotBlock::default()),
-            "000103fc70110100fb8a02fb1032ff90c81e14963c2864501e00fc0ead2500fbd007fb8713fb50c3123f01ff02fe03fd28 \
-             ce3c7f800001fb204efb6ff500140a010203fffefd7f8000050607ff90c81e14963c2864501e0164fa00",
+            "709b008938209908643086509948000f120a3e85387206a02d86651a4f17321dc47043821b027108548000013880aca9 \
+             68cea13e15e2835ef643086509949900",
         ),
         (go(None), "010103fbfb00fc0ead2500fb8a0200"),
         (
@@ -306,7 +304,7 @@ fn operator_datagrams() {
                     weight: [127, -64, 0, 64, 1, 100],
                 }),
             })),
-            "010103fbfb00fc0ead2500fb8a0201fcc0c62d008000000001fc0ead2500fbd007fb8713fb50c3123f \
+            "010103fbfb00fc0ead2500fb8a0201fcc0c62d008000000001fc14ad2500fbd007fb8713fb50c3123f \
              01ff02fe03fd28ce3c7f8000ff807fc000400164",
         ),
         (

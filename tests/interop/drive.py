@@ -21,7 +21,7 @@ from telemime import path, state
 
 RADIUS, TURNS_PER_S, SECONDS, SCALE = 0.12, 0.4, 6.0, 0.5
 BOUND_UM, SAMPLE_US, LEASE_MS = 5_000, 33_333, 650
-CONSTANT_VELOCITY = {"gain": 255, "inflation": 128, "weights": [[0, 0, 255]] * 3}
+CONSTANT_VELOCITY = {"gain": 255, "inflation": 128, "weights": [[0, 0, 15]] * 3}
 
 
 def identity():

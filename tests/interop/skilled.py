@@ -15,7 +15,7 @@ from drive import Circle, Hand, Robot, SECONDS, followed, identity, pair
 from telemime import predict, skill, state
 
 RATE_HZ, EVERY = 30, 4
-PARAMS = {"gain": 255, "inflation": 128, "weights": [[200, 25, 20], [170, 45, 25], [140, 60, 25]]}
+PARAMS = {"gain": 255, "inflation": 128, "weights": [[12, 1, 1], [10, 3, 1], [8, 4, 1]]}
 
 
 def learned(program, folder):

@@ -7,7 +7,7 @@ from telemime import (
     bend, codec, frames, greeting, lease, messages, pairing, path, plan, predict, rotation, skill, spline, state)  # fmt: skip
 
 STATE = bytes.fromhex("fc808d5b00 fb401ffb9f0ffb50c3 2345 50e00060dc0464d80450e205")
-PARAMS = {"gain": 255, "inflation": 136, "weights": [[230, 10, 10], [180, 40, 30], [128, 60, 50]]}
+PARAMS = {"gain": 255, "inflation": 136, "weights": [[13, 1, 1], [11, 2, 2], [8, 4, 3]]}
 
 
 def hand():

@@ -146,7 +146,6 @@ fn a_live_hand_costs_less_than_its_samples() {
     let quick_long = drive(config(0.3), fast);
     quick_long.row("1 kHz, 650 ms");
     assert!(short.share() <= 1.0, "{short:?}");
-    // The aim is a third; docs/experiments.md says what is in the way.
-    assert!(long.share() <= 0.42, "{long:?}");
+    assert!(long.share() <= 1.0 / 3.0, "{long:?}");
     assert!(quick_long.share() <= 1.0 / 50.0, "{quick_long:?}");
 }

@@ -47,7 +47,7 @@ const STATE: WireState = WireState {
 const PARAMS: WireParams = WireParams {
     gain: 255,
     inflation: 136,
-    weights: [[230, 10, 10], [180, 40, 30], [128, 60, 50]],
+    weights: [[13, 1, 1], [11, 2, 2], [8, 4, 3]],
 };
 
 const TURN: WireTurn = WireTurn {
@@ -59,7 +59,7 @@ const TURN: WireTurn = WireTurn {
     params: WireParams {
         gain: 255,
         inflation: 128,
-        weights: [[0, 0, 200]; 3],
+        weights: [[0, 0, 12]; 3],
     },
 };
 

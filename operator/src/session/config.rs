@@ -77,6 +77,14 @@ impl Default for SessionConfig {
     }
 }
 
+impl SessionConfig {
+    /// The lease as it travels, ms: in steps of 10, rounded down.
+    pub(super) fn lease_ms(&self) -> u16 {
+        // What is a step but for the last bit is one.
+        (self.lease_s * 1e2 + 1e-6) as u16 * 10
+    }
+}
+
 /// The hand at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HandSample {

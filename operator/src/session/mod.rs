@@ -604,7 +604,7 @@ impl Session {
         let again = std::mem::take(&mut self.news) && self.pace.repeats();
         self.repeat = again.then(|| now.offset_by_secs(REPEAT_S));
         self.seq += 1;
-        let lease_ms = (self.config.lease_s * 1e3) as u16;
+        let lease_ms = self.config.lease_ms();
         let network_s = self.network_delay_s();
         let ahead = self.ahead(now);
         let datagram = match &mut self.activity {
@@ -660,7 +660,7 @@ impl Session {
             path_bound_um: bounds.place_um(),
             path_turn_bound_urad: bounds.turn_urad(),
             sample_us: self.interval.us(),
-            lease_ms: (self.config.lease_s * 1e3) as u16,
+            lease_ms: self.config.lease_ms(),
         };
         self.control(&OperatorControl::Engage(engage));
     }

@@ -7,18 +7,18 @@
 const MAX_BITS: u32 = 40;
 
 /// The largest order a column may have.
-pub(super) const MAX_ORDER: u32 = 31;
+pub(crate) const MAX_ORDER: u32 = 31;
 
 /// Bits, highest first within a byte.
 #[derive(Clone, Debug, Default)]
-pub(super) struct BitWriter {
+pub(crate) struct BitWriter {
     bytes: Vec<u8>,
     used: u32,
 }
 
 impl BitWriter {
     /// The low `count` bits of `value`.
-    pub(super) fn put(&mut self, value: u64, count: u32) {
+    pub(crate) fn put(&mut self, value: u64, count: u32) {
         for i in (0..count).rev() {
             if self.used == 0 {
                 self.bytes.push(0);
@@ -34,7 +34,7 @@ impl BitWriter {
     }
 
     /// `n` in the code of order `k`.
-    pub(super) fn golomb(&mut self, n: u64, k: u32) {
+    pub(crate) fn golomb(&mut self, n: u64, k: u32) {
         let q = (n >> k) + 1;
         let bits = q.ilog2();
         self.put(0, bits);
@@ -43,29 +43,29 @@ impl BitWriter {
     }
 
     /// `n` as [`BitWriter::golomb`] of 2n, or of −2n − 1 below zero.
-    pub(super) fn signed(&mut self, n: i64, k: u32) {
+    pub(crate) fn signed(&mut self, n: i64, k: u32) {
         self.golomb(zigzag(n), k);
     }
 
     /// The bytes, the last one filled up with zeros.
-    pub(super) fn finish(self) -> Vec<u8> {
+    pub(crate) fn finish(self) -> Vec<u8> {
         self.bytes
     }
 }
 
 /// The bits of a slice. `None` where they end, or where a number is longer than any there is.
 #[derive(Clone, Debug)]
-pub(super) struct BitReader<'a> {
+pub(crate) struct BitReader<'a> {
     bytes: &'a [u8],
     at: usize,
 }
 
 impl<'a> BitReader<'a> {
-    pub(super) fn new(bytes: &'a [u8]) -> Self {
+    pub(crate) fn new(bytes: &'a [u8]) -> Self {
         Self { bytes, at: 0 }
     }
 
-    pub(super) fn take(&mut self, count: u32) -> Option<u64> {
+    pub(crate) fn take(&mut self, count: u32) -> Option<u64> {
         let mut value = 0;
         for _ in 0..count {
             let byte = self.bytes.get(self.at / 8)?;
@@ -75,7 +75,7 @@ impl<'a> BitReader<'a> {
         Some(value)
     }
 
-    pub(super) fn golomb(&mut self, k: u32) -> Option<u64> {
+    pub(crate) fn golomb(&mut self, k: u32) -> Option<u64> {
         let mut bits = 0;
         while self.take(1)? == 0 {
             bits += 1;
@@ -89,35 +89,40 @@ impl<'a> BitReader<'a> {
         Some(high | low).filter(|n| *n < 1 << MAX_BITS)
     }
 
-    pub(super) fn signed(&mut self, k: u32) -> Option<i64> {
+    pub(crate) fn signed(&mut self, k: u32) -> Option<i64> {
         self.golomb(k).map(unzigzag)
     }
 
+    /// The bytes after the one begun, whatever that is filled up with.
+    pub(crate) fn rest(self) -> &'a [u8] {
+        &self.bytes[self.at.div_ceil(8)..]
+    }
+
     /// Whether only the filling of the last byte is left, and is zero.
-    pub(super) fn at_end(mut self) -> bool {
+    pub(crate) fn at_end(mut self) -> bool {
         let left = self.bytes.len() * 8 - self.at;
         left < 8 && self.take(left as u32) == Some(0)
     }
 }
 
 /// 0, −1, 1, −2, … as 0, 1, 2, 3, …
-pub(super) fn zigzag(n: i64) -> u64 {
+pub(crate) fn zigzag(n: i64) -> u64 {
     (n << 1 ^ n >> 63) as u64
 }
 
 /// What [`zigzag`] was given, of a number below 2⁶³.
-pub(super) fn unzigzag(n: u64) -> i64 {
+pub(crate) fn unzigzag(n: u64) -> i64 {
     let half = (n >> 1) as i64;
     if n & 1 == 0 { half } else { -half - 1 }
 }
 
 /// How many bits [`BitWriter::golomb`] takes.
-pub(super) fn golomb_bits(n: u64, k: u32) -> u64 {
+pub(crate) fn golomb_bits(n: u64, k: u32) -> u64 {
     u64::from(2 * ((n >> k) + 1).ilog2() + 1 + k)
 }
 
 /// The order in which `numbers` take the fewest bits (of several, the lowest), and how many.
-pub(super) fn best_order(numbers: &[u64]) -> (u32, u64) {
+pub(crate) fn best_order(numbers: &[u64]) -> (u32, u64) {
     let bits = |k| numbers.iter().map(|n| golomb_bits(*n, k)).sum();
     let first = (0, bits(0));
     (1..=MAX_ORDER).fold(first, |best, k| {

@@ -5,7 +5,7 @@
 //! still *happening* (mirror): knots appended one by one to a C¹ curve. In both the promise is checked
 //! on what the receiver decodes, after quantisation.
 
-mod bits;
+pub(crate) mod bits;
 mod packed;
 pub mod path;
 mod plan;

@@ -3,8 +3,13 @@
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
+use crate::checkpoint::bits::{BitReader, BitWriter};
+
 /// The largest exponent that half a byte holds.
 const MAX_EXPONENT: u8 = 15;
+
+/// Order of the codes of a component's difference to what is expected of it.
+const OFFSET_ORDER: u32 = 4;
 
 /// Four vectors in bytes, each with a power-of-two step of its own: what happened in the last moments is small and says how fast
 /// the hand is now, what happened before is large, and neither is to be rounded as coarsely as the other needs.
@@ -35,6 +40,42 @@ impl WireMemory {
         Some(wire)
     }
 
+    /// As bits: a longer memory lies about half as far again in the same direction.
+    pub(super) fn write(&self, w: &mut BitWriter) {
+        let exponents = self.exponents();
+        w.put(u64::from(exponents[0]), 4);
+        for pair in exponents.windows(2) {
+            w.signed(i64::from(pair[1]) - i64::from(pair[0]), 0);
+        }
+        for (i, offsets) in self.offsets.iter().enumerate() {
+            for (axis, n) in offsets.iter().enumerate() {
+                let expected = expected(&self.offsets, exponents, i, axis);
+                w.signed(i64::from(*n) - expected, OFFSET_ORDER);
+            }
+        }
+    }
+
+    /// What [`WireMemory::write`] wrote.
+    pub(super) fn read(r: &mut BitReader<'_>) -> Option<Self> {
+        let mut exponents = [r.take(4)? as u8; 4];
+        for i in 1..exponents.len() {
+            let exponent = i64::from(exponents[i - 1]) + r.signed(0)?;
+            exponents[i] = u8::try_from(exponent).ok().filter(|e| *e <= MAX_EXPONENT)?;
+        }
+        let mut offsets = [[0; 3]; 4];
+        for i in 0..offsets.len() {
+            for axis in 0..3 {
+                let n = expected(&offsets, exponents, i, axis) + r.signed(OFFSET_ORDER)?;
+                offsets[i][axis] = i8::try_from(n).ok()?;
+            }
+        }
+        let [a, b, c, d] = exponents;
+        Some(Self {
+            exponents: [a << 4 | b, c << 4 | d],
+            offsets,
+        })
+    }
+
     /// The exponents, one for each memory.
     pub(super) fn exponents(&self) -> [u8; 4] {
         let [a, b] = self.exponents;
@@ -49,4 +90,13 @@ impl WireMemory {
             Vector3::from(self.offsets[i].map(|n| f64::from(n) * step))
         })
     }
+}
+
+/// What the memory before leads to expect of a component, in steps: half as much again, rounded down.
+fn expected(offsets: &[[i8; 3]; 4], exponents: [u8; 4], i: usize, axis: usize) -> i64 {
+    let Some(before) = i.checked_sub(1) else {
+        return 0;
+    };
+    let thrice = (3 * i64::from(offsets[before][axis])) << exponents[before];
+    (thrice >> (exponents[i] + 1)).clamp(-127, 127)
 }

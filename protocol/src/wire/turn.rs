@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::codec::DecodeError;
 use super::memory::WireMemory;
 use super::v1::WireParams;
+use crate::checkpoint::bits::{BitReader, BitWriter};
 use crate::pose;
 use crate::predict::{TurnForecast, TurnState};
 use crate::skill::Skill;
@@ -77,6 +78,28 @@ impl WireTurn {
                 .expect("no angle between two orientations is above π"),
             params,
         }
+    }
+
+    /// As bits.
+    pub(super) fn write(&self, w: &mut BitWriter) {
+        for n in self.q.0 {
+            w.put(u64::from(n.cast_unsigned()), 16);
+        }
+        self.memory.write(w);
+        self.params.write(w);
+    }
+
+    /// What [`WireTurn::write`] wrote.
+    pub(super) fn read(r: &mut BitReader<'_>) -> Option<Self> {
+        let mut q = WireRotation::default();
+        for n in &mut q.0 {
+            *n = (r.take(16)? as u16).cast_signed();
+        }
+        Some(Self {
+            q,
+            memory: WireMemory::read(r)?,
+            params: WireParams::read(r)?,
+        })
     }
 
     /// The state both ends predict from; `t` is that of the hand state it came with.
@@ -156,7 +179,7 @@ mod tests {
             memory in prop::array::uniform4(rotation()),
         ) {
             let state = TurnState { t: Stamp(7), q, memory };
-            let params = WireParams { gain: 255, inflation: 128, weights: [[100, 0, 155]; 3] };
+            let params = WireParams { gain: 255, inflation: 128, weights: [[6, 0, 9]; 3] };
             let wire = WireTurn::quantise(&state, params);
             let pose = WirePose { turn: Some(wire), grip: None };
             prop_assert!(pose.check().is_ok());

@@ -15,7 +15,9 @@ use super::state::WireState;
 use super::turn::{WirePose, WireRotation};
 use crate::checkpoint::path::{MAX_TURN_URAD, PathBounds};
 
+mod motion;
 mod reports;
+pub use motion::Motion;
 pub use reports::{Reception, RobotDatagram, ServoTimes, Telemetry};
 
 /// The version this module speaks.
@@ -285,6 +287,9 @@ pub enum Refusal {
     NotYours,
 }
 
+/// Operator → robot, datagrams. A [`Motion`] is bits of its own; of the others the first byte is the index, from 1 to this.
+const LAST_OPERATOR_DATAGRAM: u8 = 4;
+
 /// Operator → robot, datagrams.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum OperatorDatagram {
@@ -340,33 +345,6 @@ pub struct ExternalClock {
     pub dispersion_us: u32,
 }
 
-/// The newest state of the hand, and the knots of its path that are not yet acknowledged.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Motion {
-    /// The session's epoch.
-    pub epoch: u32,
-    /// The engagement this belongs to.
-    pub engagement: u32,
-    /// Counts up with every motion or go of the session.
-    pub seq: u32,
-    /// For how long motion is authorised from arrival, ms.
-    pub lease_ms: u16,
-    /// [`model_tag`] of the model to predict with; 0 is constant velocity.
-    pub model: u16,
-    /// Parameters to predict with.
-    pub params: WireParams,
-    /// Checksum of the operator's own prediction from `state` and `pose`, in keyframes.
-    pub checksum: Option<u32>,
-    /// The newest hand state.
-    pub state: WireState,
-    /// The newest orientation and gripper, as far as the input has them.
-    pub pose: WirePose,
-    /// Number of the first of `knots` in the engagement's path.
-    pub first_knot: u32,
-    /// Unacknowledged knots of the path in order, the oldest first.
-    pub knots: KnotBlock,
-}
-
 /// Knots of the path that ride on the control stream.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PathTail {
@@ -410,8 +388,28 @@ macro_rules! message {
 
 message!(OperatorControl, MAX_FRAME_LEN);
 message!(RobotControl, MAX_FRAME_LEN);
-message!(OperatorDatagram, MAX_DATAGRAM_LEN);
 message!(RobotDatagram, MAX_DATAGRAM_LEN);
+
+impl Message for OperatorDatagram {
+    fn encode(&self) -> Vec<u8> {
+        match self {
+            Self::Motion(motion) => motion.pack(),
+            _ => codec::encode(self),
+        }
+    }
+
+    fn decode(bytes: &[u8]) -> Result<Self, DecodeError> {
+        let message = match bytes.first() {
+            Some(_) if Motion::begins(bytes) => Self::Motion(Motion::unpack(bytes)?),
+            None | Some(1..=LAST_OPERATOR_DATAGRAM) => {
+                codec::decode::<Self, MAX_DATAGRAM_LEN>(bytes)?
+            }
+            Some(kind) => return Err(DecodeError::Malformed(format!("no message {kind}"))),
+        };
+        message.check()?;
+        Ok(message)
+    }
+}
 
 fn require(ok: bool, field: &'static str, why: &'static str) -> Result<(), DecodeError> {
     if ok {
@@ -522,12 +520,7 @@ impl RobotControl {
 impl OperatorDatagram {
     fn check(&self) -> Result<(), DecodeError> {
         match self {
-            Self::Motion(motion) => {
-                motion.knots.check("motion.knots", MAX_KNOTS)?;
-                motion.state.check()?;
-                motion.params.check("motion.params")?;
-                motion.pose.check()
-            }
+            Self::Motion(motion) => motion.check(),
             Self::Go { bend, .. } => bend.as_ref().map_or(Ok(()), WireBend::check),
             Self::Pong { .. } | Self::Stop { .. } | Self::Clock { .. } => Ok(()),
         }

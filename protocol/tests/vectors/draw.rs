@@ -55,7 +55,7 @@ impl Draw {
 
     pub(crate) fn state(&mut self) -> WireState {
         WireState {
-            t_us: self.signed(53),
+            t_us: 10 * self.signed(49),
             x: std::array::from_fn(|_| self.signed(19) as i32),
             memory: self.memory(16),
         }
@@ -78,9 +78,9 @@ impl Draw {
             gain: self.u8(),
             inflation: self.u8(),
             weights: std::array::from_fn(|_| {
-                let first = self.u8();
-                let second = (self.u8()).min(255 - first);
-                [first, second, (255 - first - second) / 2]
+                let first = self.below(16) as u8;
+                let second = (self.below(16) as u8).min(15 - first);
+                [first, second, (15 - first - second) / 2]
             }),
         }
     }

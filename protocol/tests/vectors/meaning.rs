@@ -56,7 +56,7 @@ pub(crate) fn foretold(motion: &Motion, skill: Option<&Skill>) -> Value {
 pub(crate) fn moving(i: u32) -> Motion {
     let s = f64::from(i);
     let mut state = WireState {
-        t_us: 3_000_000 + i64::from(i) * 33_333,
+        t_us: 3_000_000 + i64::from(i) * 33_330,
         x: [(1000.0 * s) as i32 - 3000, 500 - 200 * i as i32, 8000],
         memory: WireMemory {
             exponents: [

@@ -224,13 +224,13 @@ fn motion(draw: &mut Draw, knot_count: usize) -> Motion {
         epoch: draw.u32(),
         engagement: draw.u32(),
         seq: draw.u32(),
-        lease_ms: draw.u16(),
+        lease_ms: 10 * u16::from(draw.u8()),
         model: draw.u16(),
         params: draw.params(),
         checksum: draw.maybe(Draw::u32),
         state,
         pose: draw.pose(),
-        first_knot: draw.u32(),
+        first_knot: if path.is_empty() { 0 } else { draw.u32() },
         knots: KnotBlock::pack(&state, code(0), &[], &path).expect("a path before the state"),
     }
 }

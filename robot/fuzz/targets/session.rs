@@ -223,7 +223,7 @@ impl Bench {
 
     fn engage(&mut self, input: &mut Input<'_>) {
         let (engagement, ms_ago) = (input.byte().into(), input.byte());
-        let weights = [[0, 0, input.byte()]; 3];
+        let weights = [[0, 0, input.byte() & 15]; 3];
         let params = WireParams {
             gain: 255,
             inflation: 128,
@@ -259,12 +259,12 @@ impl Bench {
             epoch: EPOCH,
             engagement: self.engagement,
             seq: self.seq,
-            lease_ms: u16::from(input.byte()) * 8,
+            lease_ms: u16::from(input.byte()) * 10,
             model: 0,
             params: WireParams {
                 gain: 255,
                 inflation: 128,
-                weights: [[0, 0, input.byte()]; 3],
+                weights: [[0, 0, input.byte() & 15]; 3],
             },
             checksum: None,
             state: self.state(input, ms_ago),

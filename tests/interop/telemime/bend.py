@@ -19,7 +19,7 @@ def offset(bend, h, k):
     held = bend["held"]
     if held:
         hand = state.Hand.of_wire(held["state"])
-        params = {"gain": held["gain"], "inflation": 128, "weights": [[0, 0, held["straight"]]] * 3}
+        params = {"gain": held["gain"], "inflation": 128, "weights": [[0, 0, held["straight"] * 15 / 255]] * 3}
         ahead = [x + d for x, d in zip(hand.x, predict.place(hand, params).at(min(k, FARTHEST))[0])]
         xx, yx, yy, zx, zy, zz = (n / 127 for n in held["weight"])
         for i, row in enumerate(((xx, yx, zx), (yx, yy, zy), (zx, zy, zz))):

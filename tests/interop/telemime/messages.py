@@ -1,9 +1,13 @@
 """Every message of version 1 (§4, §5), field by field."""
 
 from . import path
-from .codec import (F32, I8, I32, I64, U8, U16, U32, U64, Array, Bytes, Enum, Option, Struct, Text, Vec, WireError, decode, encode, finite, require)
+from .bits import BitReader, BitWriter
+from .codec import (
+    F32, I8, I32, I64, U8, U16, U32, U64, Array, Bytes, Enum, Kind, Option, Struct, Text, Vec, WireError, decode, encode, finite,
+    require)  # fmt: skip
 from .frames import LONGEST
-from .state import PARAMS, POSE, ROTATION, STATE, _rotation_range
+from .state import (
+    PARAMS, POSE, ROTATION, STATE, _rotation_range, read_params, read_state, read_turn, write_params, write_state, write_turn)  # fmt: skip
 
 DATAGRAM = 1100
 ID = Array(U8, 16)
@@ -134,10 +138,84 @@ ROBOT_CONTROL = Enum(
     ("State", Struct(("state", STATES), ("cause", CAUSES), ("changes", U32))),
     ("Arm", Struct(("joints", Vec(JOINT, 10)), ("tip", PLACE), ("capsules", Vec(CAPSULE, 64)), check=_arm)),
 )  # fmt: skip
-OPERATOR_DATAGRAM = Enum(
-    ("Motion", Struct(
+
+
+class Motion(Kind):
+    """The one message of bits (§5)."""
+
+    FIELDS = Struct(
         ("epoch", U32), ("engagement", U32), ("seq", U32), ("lease_ms", U16), ("model", U16), ("params", PARAMS),
-        ("checksum", Option(U32)), ("state", STATE), ("pose", POSE), ("first_knot", U32), ("knots", Knots(32)))),
+        ("checksum", Option(U32)), ("state", STATE), ("pose", POSE), ("first_knot", U32), ("knots", Knots(32)))  # fmt: skip
+
+    def check(self, m):
+        self.FIELDS.check(m)
+
+    def read(self, r):
+        b = BitReader(r.data)
+        checksum, model, turn, grip, knots = (b.bits(1) for _ in range(5))
+        b.bits(3)
+        m = {"epoch": _number(b, 3), "engagement": _number(b, 3), "seq": _number(b, 8), "lease_ms": 10 * b.bits(8)}
+        m["model"] = b.bits(16) if model else 0
+        m["params"] = read_params(b)
+        m["checksum"] = b.bits(32) if checksum else None
+        m["state"] = read_state(b)
+        m["pose"] = {"turn": read_turn(b) if turn else None, "grip": b.bits(8) if grip else None}
+        m["first_knot"] = _number(b, 8) if knots else 0
+        r.at = (b.at + 7) // 8
+        m["knots"] = bytes(r.take(len(r.data) - r.at)) if knots else b""
+        return m
+
+    def write(self, m, out):
+        b, turn, grip = BitWriter(), m["pose"]["turn"], m["pose"]["grip"]
+        for has in (m["checksum"] is not None, m["model"] != 0, turn is not None, grip is not None, bool(m["knots"])):
+            b.bits(int(has), 1)
+        b.bits(0, 3)
+        b.golomb(m["epoch"], 3)
+        b.golomb(m["engagement"], 3)
+        b.golomb(m["seq"], 8)
+        b.bits(min(m["lease_ms"] // 10, 255), 8)
+        if m["model"]:
+            b.bits(m["model"], 16)
+        write_params(b, m["params"])
+        if m["checksum"] is not None:
+            b.bits(m["checksum"], 32)
+        write_state(b, m["state"])
+        if turn is not None:
+            write_turn(b, turn)
+        if grip is not None:
+            b.bits(grip, 8)
+        if m["knots"]:
+            b.golomb(m["first_knot"], 8)
+        out += b.bytes() + m["knots"]
+
+
+def _number(b, order):
+    n = b.golomb(order)
+    if n >> 32:
+        raise WireError("Malformed", f"{n} is more than 32 bits")
+    return n
+
+
+class OperatorDatagram(Enum):
+    """A motion, if the low three bits of the first byte are 0; else the first byte is the variant's index (§5)."""
+
+    def read(self, r):
+        if r.data and r.data[0] % 8 and r.data[0] >= len(self.variants):
+            raise WireError("Malformed", f"no message {r.data[0]}")
+        if r.data and r.data[0] % 8 == 0:
+            return {"Motion": MOTION.read(r)}
+        return super().read(r)
+
+    def write(self, value, out):
+        if "Motion" in value:
+            MOTION.write(value["Motion"], out)
+        else:
+            super().write(value, out)
+
+
+MOTION = Motion()
+OPERATOR_DATAGRAM = OperatorDatagram(
+    ("Motion", MOTION),
     ("Go", Struct(
         ("epoch", U32), ("engagement", U32), ("seq", U32), ("t_us", I64), ("lease_ms", U16), ("bend", Option(BEND)))),
     ("Pong", Struct(("epoch", U32), ("t1_us", I64), ("t2_us", I64), ("t3_us", I64))),

@@ -130,7 +130,7 @@ def velocity(apart):
 
 def weights_at(params, j):
     """Of mixture, generic extrapolator and straight line at knot j."""
-    rows = [[n / 255 for n in row] for row in params["weights"]]
+    rows = [[n / 15 for n in row] for row in params["weights"]]
     for (a, first), (b, last) in zip(zip(BANDS, rows), zip(BANDS[1:], rows[1:])):
         if j <= b:
             u = max(j - a, 0) / (b - a)

@@ -3,7 +3,7 @@
 import math
 
 from . import rotation
-from .codec import I8, I16, I32, I64, U8, Array, Option, Struct, require, round_away
+from .codec import I8, I16, I32, I64, U8, Array, Option, Struct, WireError, require, round_away, unzigzag, zigzag
 
 TAU = (0.05, 0.1333, 0.3333, 0.8333)
 PLACE, MEMORY, ANGLE, TURN_MEMORY = 1e-4, 25e-6, 1e-4, 25e-6
@@ -24,7 +24,7 @@ def _turn_ranges(s):
 
 
 def _weights(p):
-    require(all(sum(row) <= 255 for row in p["weights"]), "weights", p["weights"])
+    require(all(sum(row) <= 15 for row in p["weights"]), "weights", p["weights"])
 
 
 PARAMS = Struct(("gain", U8), ("inflation", U8), ("weights", Array(Array(U8, 3), 3)), check=_weights)
@@ -43,6 +43,82 @@ def exponents(memory):
 def remembered(memory, unit):
     """The four vectors, in units of 1."""
     return [[unit * 2.0**e * n for n in row] for e, row in zip(exponents(memory), memory["offsets"])]
+
+
+def write_params(b, p):
+    """Parameters in a motion (§5)."""
+    b.bits(int(p["gain"] == 255), 1)
+    if p["gain"] != 255:
+        b.bits(p["gain"], 8)
+    b.bits(p["inflation"], 8)
+    for n in sum(p["weights"], []):
+        b.bits(n, 4)
+
+
+def read_params(b):
+    gain = 255 if b.bits(1) else b.bits(8)
+    return {"gain": gain, "inflation": b.bits(8), "weights": [[b.bits(4) for _ in range(3)] for _ in range(3)]}
+
+
+def expected(offsets, e, i, axis):
+    """What the memory before leads to expect of a component."""
+    return max(-127, min(127, 3 * offsets[i - 1][axis] * 2 ** e[i - 1] // 2 ** (e[i] + 1))) if i else 0
+
+
+def write_memory(b, memory):
+    e = exponents(memory)
+    b.bits(e[0], 4)
+    for last, this in zip(e, e[1:]):
+        b.signed(this - last, 0)
+    for i, row in enumerate(memory["offsets"]):
+        for axis, n in enumerate(row):
+            b.signed(n - expected(memory["offsets"], e, i, axis), 4)
+
+
+def read_memory(b):
+    e = [b.bits(4)]
+    for _ in range(3):
+        e.append(_within("exponent", e[-1] + b.signed(0), 0, 15))
+    offsets = []
+    for i in range(4):
+        offsets.append([])
+        for axis in range(3):
+            offsets[i].append(_within("memory", expected(offsets, e, i, axis) + b.signed(4), -128, 127))
+    return {"exponents": [e[0] << 4 | e[1], e[2] << 4 | e[3]], "offsets": offsets}
+
+
+def _within(what, n, low, high):
+    if not low <= n <= high:
+        raise WireError("Malformed", f"{what} {n}")
+    return n
+
+
+def write_state(b, s):
+    ticks = zigzag((s["t_us"] + 5) // 10)
+    size = next(i for i in range(4) if i == 3 or ticks < 1 << 30 + 8 * i)
+    b.bits(size, 2)
+    b.bits(ticks, 30 + 8 * size)
+    for n in s["x"]:
+        b.signed(n, 14)
+    write_memory(b, s["memory"])
+
+
+def read_state(b):
+    t_us = 10 * unzigzag(b.bits(30 + 8 * b.bits(2)))
+    x = [_within("x", b.signed(14), -(2**31), 2**31 - 1) for _ in range(3)]
+    return {"t_us": t_us, "x": x, "memory": read_memory(b)}
+
+
+def write_turn(b, turn):
+    for n in turn["q"]:
+        b.bits(n % 2**16, 16)
+    write_memory(b, turn["memory"])
+    write_params(b, turn["params"])
+
+
+def read_turn(b):
+    q = [(b.bits(16) + 2**15) % 2**16 - 2**15 for _ in range(3)]
+    return {"q": q, "memory": read_memory(b), "params": read_params(b)}
 
 
 class Hand:
@@ -66,7 +142,7 @@ class Hand:
             steps.append(next(e for e in range(16) if max(map(abs, way)) <= 127 * MEMORY * 2.0**e))
             rows.append([round_away(d / (MEMORY * 2.0 ** steps[-1])) for d in way])
         packed = [steps[0] << 4 | steps[1], steps[2] << 4 | steps[3]]
-        return {"t_us": round_away(self.t * 1e6), "x": x, "memory": {"exponents": packed, "offsets": rows}}
+        return {"t_us": 10 * round_away(self.t * 1e5), "x": x, "memory": {"exponents": packed, "offsets": rows}}
 
     def step(self, t):
         """(e, r) of each memory for a next sample at t."""

@@ -46,10 +46,10 @@ fn what_is_foreign_malformed_or_impossible_is_dropped_and_counted() {
     };
     let mut trailing = OperatorDatagram::Motion(good.clone()).encode();
     trailing.push(0);
-    // `seq` is the third integer: 1 in three bytes instead of one.
-    let mut long_form = OperatorDatagram::Motion(good.clone()).encode();
-    assert_eq!(long_form[..4], [0, EPOCH as u8, 1, 1]);
-    long_form.splice(3..4, [0xfb, 1, 0]);
+    // The epoch in three bytes instead of one.
+    let mut long_form = OperatorDatagram::Stop { epoch: EPOCH }.encode();
+    assert_eq!(long_form, [3, EPOCH as u8]);
+    long_form.splice(1..2, [0xfb, EPOCH as u8, 0]);
     let bad = [
         motion(|m| m.epoch += 1),
         motion(|m| m.engagement = 0),
