@@ -292,15 +292,15 @@ fn report(set: &str, scores: &Scores) {
 /// The knots at which predictions are judged: 100, 200 and 300 ms.
 const JUDGED: [usize; 3] = [3, 6, 9];
 
-/// Ratios to hold at 100, 200 and 300 ms that the mixture and what the session sends must reach within 2 %; returns the
-/// latter. Fused, the same prediction may not be worse than the best that needs no model by more than 5 %, and its region of 90 % holds 80 to 99.5 %.
+/// Ratios to hold at 100, 200 and 300 ms that the mixture and what the session sends must reach within 1 %; returns the
+/// latter. Fused, the same prediction may not be worse than the best that needs no model by more than 5 %, and its region of 90 % holds 85 to 98 %.
 fn must_reach(set: &str, scores: &Scores, mixture: [f64; 3], fused: [f64; 3]) -> [f64; 3] {
     report(set, scores);
     for (name, bar) in [("gmr", mixture), ("fused", fused)] {
         for (knot, bar) in JUDGED.into_iter().zip(bar) {
             let ratio = scores.ratio(name, knot);
             assert!(
-                ratio < 1.02 * bar,
+                ratio < 1.01 * bar,
                 "{set}, {name}, knot {knot}: {ratio:.3} against {bar}"
             );
         }
@@ -313,8 +313,9 @@ fn must_reach(set: &str, scores: &Scores, mixture: [f64; 3], fused: [f64; 3]) ->
             "{set}, knot {knot}: {ratio:.3} against {simple:.3}"
         );
         let held = scores.covered(knot);
+        println!("{set}, knot {knot}: {held:.3} within the region of 0.9");
         assert!(
-            (0.8..0.995).contains(&held),
+            (0.85..0.98).contains(&held),
             "{set}, knot {knot}: {held:.3} of 0.9"
         );
     }
@@ -338,29 +339,32 @@ fn gestures_are_predicted_better_than_by_the_prototype() {
     }
     let mean = product.map(|p| p.powf(0.25));
     println!("utd_mhad, geometric mean: {mean:.3?}");
+    for (mean, bar) in mean.into_iter().zip([0.372, 0.346, 0.322]) {
+        assert!(mean < 1.01 * bar, "{mean:.3} against {bar}");
+    }
 }
 
 /// Of the mixture alone, and fused.
 const GESTURES: [(&str, [[f64; 3]; 2]); 5] = [
     (
         "utd_mhad/a03_wave",
-        [[0.388, 0.360, 0.348], [0.389, 0.358, 0.347]],
+        [[0.386, 0.358, 0.346], [0.388, 0.358, 0.347]],
     ),
     (
         "utd_mhad/a01_swipe_left",
-        [[0.380, 0.322, 0.284], [0.378, 0.329, 0.289]],
+        [[0.378, 0.320, 0.281], [0.378, 0.329, 0.289]],
     ),
     (
         "utd_mhad/a09_circle_cw",
-        [[0.322, 0.307, 0.288], [0.317, 0.309, 0.289]],
+        [[0.319, 0.305, 0.283], [0.317, 0.309, 0.289]],
     ),
     (
         "utd_mhad/a15_tennis_swing",
-        [[0.415, 0.388, 0.370], [0.411, 0.387, 0.367]],
+        [[0.409, 0.383, 0.365], [0.411, 0.387, 0.367]],
     ),
     (
         "kard/a01_horizontal_arm_wave",
-        [[0.508, 0.485, 0.507], [0.496, 0.483, 0.510]],
+        [[0.504, 0.481, 0.501], [0.496, 0.483, 0.510]],
     ),
 ];
 
@@ -393,7 +397,7 @@ fn a_smooth_task_is_recognised_and_its_mixture_beats_the_straight_line() {
         return;
     };
     let scores = evaluate(&by_person(&folder), 3, false);
-    must_reach(set, &scores, [0.065, 0.087, 0.108], [0.060, 0.080, 0.100]);
+    must_reach(set, &scores, [0.064, 0.085, 0.105], [0.058, 0.078, 0.097]);
     for knot in JUDGED {
         assert!(scores.ratio("gmr", knot) < scores.ratio("cv", knot));
     }
@@ -441,7 +445,7 @@ fn off_the_model_nothing_is_worse_than_standing_still_by_a_tenth() {
                 let (ratio, simple) = (together.ratio("fused", knot), together.simple(knot));
                 println!("{learned} on {set}, knot {knot}: {ratio:.3}, best simple {simple:.3}");
                 assert!(
-                    ratio < 1.3 * simple,
+                    ratio < 1.2 * simple,
                     "{learned} on {set}: {ratio:.3}, {simple:.3}"
                 );
             }
@@ -450,6 +454,6 @@ fn off_the_model_nothing_is_worse_than_standing_still_by_a_tenth() {
     for knot in JUDGED {
         let held = all.covered(knot);
         println!("knot {knot}: {held:.3} within the region of 0.9");
-        assert!(held > 0.8, "knot {knot}: {held:.3}");
+        assert!(held > 0.9, "knot {knot}: {held:.3}");
     }
 }
