@@ -166,8 +166,8 @@ fn rounded(model: &Model) -> Model {
 #[derive(Default)]
 struct Scores {
     squared: BTreeMap<&'static str, Vec<f64>>,
-    /// At every knot the predictions judged, and those whose truth was within the region of 90 %.
-    judged: [[u32; 2]; 24],
+    /// At every knot the predictions judged, and those whose truth was within the region of 50, 90 and 95 %.
+    judged: [[u32; 4]; 24],
 }
 
 impl Scores {
@@ -182,10 +182,15 @@ impl Scores {
         simple.into_iter().fold(f64::INFINITY, f64::min)
     }
 
+    /// The shares of truths within the regions that are to hold 50, 90 and 95 %.
+    fn held(&self, knot: usize) -> [f64; 3] {
+        let [judged, within @ ..] = self.judged[knot - 1];
+        within.map(|n| f64::from(n) / f64::from(judged))
+    }
+
     /// The share of truths within the region that is to hold 90 %.
     fn covered(&self, knot: usize) -> f64 {
-        let [judged, within] = self.judged[knot - 1];
-        f64::from(within) / f64::from(judged)
+        self.held(knot)[1]
     }
 
     fn ratio(&self, name: &str, knot: usize) -> f64 {
@@ -242,6 +247,9 @@ fn reach_m(demos: &[Demonstration]) -> f64 {
     (most - least).norm()
 }
 
+/// The 50, 90 and 95 % quantiles of χ² with three degrees of freedom.
+const REGIONS: [f64; 3] = [2.366, 6.251, 7.815];
+
 /// Scores every expert, and what the session would have sent.
 fn score(model: &Model, reach_m: f64, test: &Demonstration, scores: &mut Scores) {
     let end_s = test.last().t_s + 1e-9;
@@ -273,8 +281,11 @@ fn score(model: &Model, reach_m: f64, test: &Demonstration, scores: &mut Scores)
             let [xx, xy, xz, yy, yz, zz] = knot.covariance;
             let covariance = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz);
             let nees = error.dot(&(covariance.try_inverse().unwrap() * error));
-            scores.judged[j - 1][0] += 1;
-            scores.judged[j - 1][1] += u32::from(nees < 6.251);
+            let [judged, within @ ..] = &mut scores.judged[j - 1];
+            *judged += 1;
+            for (within, region) in within.iter_mut().zip(REGIONS) {
+                *within += u32::from(nees < region);
+            }
         }
     }
 }
@@ -293,7 +304,7 @@ fn report(set: &str, scores: &Scores) {
 const JUDGED: [usize; 3] = [3, 6, 9];
 
 /// Ratios to hold at 100, 200 and 300 ms that the mixture and what the session sends must reach within 1 %; returns the
-/// latter. Fused, the same prediction may not be worse than the best that needs no model by more than 5 %, and its region of 90 % holds 85 to 98 %.
+/// latter. Fused, the same prediction may not be worse than the best that needs no model by more than 5 %, and its region of 90 % holds 82 to 98.5 %.
 fn must_reach(set: &str, scores: &Scores, mixture: [f64; 3], fused: [f64; 3]) -> [f64; 3] {
     report(set, scores);
     for (name, bar) in [("gmr", mixture), ("fused", fused)] {
@@ -315,7 +326,7 @@ fn must_reach(set: &str, scores: &Scores, mixture: [f64; 3], fused: [f64; 3]) ->
         let held = scores.covered(knot);
         println!("{set}, knot {knot}: {held:.3} within the region of 0.9");
         assert!(
-            (0.85..0.98).contains(&held),
+            (0.82..0.985).contains(&held),
             "{set}, knot {knot}: {held:.3} of 0.9"
         );
     }
@@ -455,5 +466,51 @@ fn off_the_model_nothing_is_worse_than_standing_still_by_a_tenth() {
         let held = all.covered(knot);
         println!("knot {knot}: {held:.3} within the region of 0.9");
         assert!(held > 0.9, "knot {knot}: {held:.3}");
+    }
+}
+
+/// What the regions hold where the other tests do not look: on the smooth sets, on motion that nobody has a skill of, and on the
+/// same people's other gestures. Between 100 and 300 ms, of 90 %.
+#[test]
+fn regions_hold_nearly_what_they_say() {
+    for (set, least) in [
+        ("robottasks/openbox", 0.85),
+        ("helloworld/e", 0.8),
+        ("helloworld/h", 0.8),
+        ("helloworld/l", 0.8),
+        ("vr_hvr_ik/free_arm", 0.78),
+    ] {
+        let Some(folder) = needs(&format!("data/demos/{set}")) else {
+            return;
+        };
+        holds(set, &evaluate(&by_person(&folder), 3, false), least);
+    }
+    let gestures = GESTURES.map(|(set, _)| set);
+    for learned in &gestures[..4] {
+        let Some(folder) = needs(&format!("data/demos/{learned}")) else {
+            return;
+        };
+        let mut scores = Scores::default();
+        for mut person in by_person(&folder) {
+            person.truncate(3);
+            let name = person[0].name().to_owned();
+            let (_, who) = name.split_once('_').unwrap();
+            let model = train(&person, &[], &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
+            for other in gestures[..4].iter().filter(|set| *set != learned) {
+                for group in by_person(&data().join("data/demos").join(other)) {
+                    let own = group.iter().filter(|d| d.name().ends_with(who));
+                    own.for_each(|test| score(&model, reach_m(&person), test, &mut scores));
+                }
+            }
+        }
+        holds(&format!("not {learned}"), &scores, 0.8);
+    }
+}
+
+fn holds(set: &str, scores: &Scores, least: f64) {
+    for knot in JUDGED {
+        let held = scores.held(knot);
+        println!("{set}, knot {knot}: {held:.3?} within the regions of .5, .9, .95");
+        assert!(held[1] > least, "{set}, knot {knot}: {held:.3?}");
     }
 }

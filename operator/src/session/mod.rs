@@ -313,8 +313,6 @@ impl Session {
             }
             self.counters.samples += 1;
         }
-        // Until the next message, on average: half a silence longer.
-        mirror.used_at(self.delay_s + lag_s + 0.5 * self.config.max_silence_s);
         self.counters.knots += mirror.take(&sample, taken, hand, skill);
         let backlog = mirror.backlog();
         let arrival = now.offset_by_secs(network_s + lag_s);
