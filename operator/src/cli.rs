@@ -36,7 +36,7 @@ use crate::placed::Motion;
 use crate::recording::Scribe;
 use crate::session::Leeway;
 use crate::task::{Outcome, Recording, Task};
-pub use args::{Args, Axes};
+pub use args::{Args, Axes, parse_future_bound};
 pub use infer::{Bounds, infer};
 pub use input::InputArgs;
 use known::Known as KnownRobot;

@@ -158,7 +158,9 @@ impl Scribe {
                 self.tape.push(Entry::Trouble(text, now));
             }
             Event::Recognised {
-                skill: Some(skill), ..
+                skill: Some(skill),
+                again: false,
+                ..
             } => self.say(now, format!("the hand does: {skill}")),
             Event::Correction(change) => self.say(now, format!("the hand: {change:?}")),
             Event::Telemetry(telemetry) => {

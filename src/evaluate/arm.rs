@@ -1,13 +1,16 @@
 //! Both daemons, real QUIC and the arm, on a virtual clock: what is left of the delay at the tip.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use nalgebra::Vector3;
+use telemime_operator::cli::parse_future_bound;
 use telemime_operator::demonstration::Demonstration;
-use telemime_operator::session::SessionConfig;
+use telemime_operator::session::{FutureBound, MAX_SILENCE_S, SessionConfig};
 use telemime_operator::task::{Outcome, Recording, Task};
 use telemime_protocol::skill::Skill;
-use telemime_robot::rig::Rig;
+use telemime_robot::control::ControlConfig;
+use telemime_robot::rig::{Rig, RigError, RigOptions};
 use telemime_robot::servo::{Mapping, RAMP_S, Report};
 use telemime_sim::link::{Link, LinkConfig};
 
@@ -15,9 +18,6 @@ use crate::ground::{Pair, PairError, run_virtual};
 use crate::measure::{
     Hand, Track, follow, is_edge, rms, rmse_m, sample_and_hold, smooth_jerk_m_s3,
 };
-
-/// The hand rests this long before the recording begins, s: one engages at rest.
-const REST_S: f64 = 1.0;
 
 /// What a raw sample takes on the wire, headers included, bytes.
 const RAW_BYTES: usize = 74;
@@ -34,11 +34,76 @@ pub(super) enum ArmError {
     NotDriven(String, String),
 }
 
+/// Which arm, and how it is driven.
+#[derive(clap::Args, Debug)]
+pub(super) struct Driving {
+    /// The arm [default: a 7-axis arm of our own].
+    #[arg(long, value_name = "FILE", requires = "arm")]
+    urdf: Option<PathBuf>,
+    /// The hand is seen to rest at the first position for this long before a recording begins, s. What is judged begins half a
+    /// second after the robot has engaged, and not before the recording: without a rest its first 0.6 s are not.
+    #[arg(long, value_name = "S", requires = "arm", default_value_t = 1.0, value_parser = within(0.0, 60.0))]
+    rest: f64,
+    /// Tip metres per hand metre [default: from the demonstrations and the arm's limits].
+    #[arg(long, value_name = "S", requires = "arm", value_parser = within(1e-3, 10.0))]
+    scale: Option<f64>,
+    /// How fast the arm's reference follows, rad/s [default: 40].
+    #[arg(long, value_name = "RAD/S", requires = "arm", value_parser = within(1.0, 200.0))]
+    bandwidth: Option<f64>,
+    /// As for the operator, and of the arm's sessions only [default: 0.2way].
+    #[arg(long, value_name = "BOUND", requires = "arm", value_parser = parse_future_bound)]
+    future_bound: Option<FutureBound>,
+    /// As for the operator, s, and of the arm's sessions only [default: 0.2].
+    #[arg(long, value_name = "S", requires = "arm", value_parser = within(5e-3, MAX_SILENCE_S))]
+    max_silence: Option<f64>,
+}
+
+fn within(least: f64, most: f64) -> impl Fn(&str) -> Result<f64, String> + Clone {
+    move |text| {
+        let value = text.trim().parse::<f64>().ok();
+        value
+            .filter(|value| (least..=most).contains(value))
+            .ok_or_else(|| format!("write a number from {least} to {most}"))
+    }
+}
+
+impl Driving {
+    /// An arm over `link`, driven by sessions that are else as `session` says.
+    pub(super) fn drive(
+        &self,
+        session: &SessionConfig,
+        link: &LinkConfig,
+    ) -> Result<Drive, RigError> {
+        let default = ControlConfig::default();
+        let rig = Rig::load(&RigOptions {
+            urdf: self.urdf.clone(),
+            control: ControlConfig {
+                omega: self.bandwidth.unwrap_or(default.omega),
+                ..default
+            },
+            ..RigOptions::default()
+        })?;
+        let config = SessionConfig {
+            scale: self.scale,
+            future_bound: self.future_bound.unwrap_or(session.future_bound),
+            max_silence_s: self.max_silence.unwrap_or(session.max_silence_s),
+            ..*session
+        };
+        Ok(Drive {
+            rig,
+            config,
+            link: link.clone(),
+            rest_s: self.rest,
+        })
+    }
+}
+
 /// The link and the arm.
 pub(super) struct Drive {
-    pub(super) rig: Rig,
-    pub(super) config: SessionConfig,
-    pub(super) link: LinkConfig,
+    rig: Rig,
+    config: SessionConfig,
+    link: LinkConfig,
+    rest_s: f64,
 }
 
 /// A hand this far from where it rested has begun to move, m: more than a tracker errs by.
@@ -89,7 +154,7 @@ pub(super) fn drive(
                     ..*s
                 })
                 .collect(),
-            rest_s: REST_S,
+            rest_s: drive.rest_s,
         })
     };
     let (reports, zero_ns, summary) = run_virtual(async {

@@ -22,10 +22,8 @@ use telemime_operator::demonstration::{Demonstration, Demonstrations, PersonPatt
 use telemime_operator::session::{FutureBound, SessionConfig};
 use telemime_protocol::predict::{KNOT_SPACING_S, MAX_KNOTS};
 
-use telemime_robot::rig::{Rig, RigOptions};
-
 use crate::cli::Shape;
-use arm::Drive;
+use arm::Driving;
 use dual::Scheme;
 pub(crate) use experts::Guess;
 pub(crate) use kalman::Kalman;
@@ -77,9 +75,8 @@ pub(crate) struct Args {
     /// Drive the arm too: both daemons and real QUIC over that link, on a virtual clock.
     #[arg(long)]
     arm: bool,
-    /// The arm [default: a 7-axis arm of our own].
-    #[arg(long, value_name = "FILE", requires = "arm")]
-    urdf: Option<PathBuf>,
+    #[command(flatten)]
+    driving: Driving,
     /// The recordings' axes, as the arm is to see them.
     #[arg(long, value_enum, default_value_t = Axes::Kinect, requires = "arm")]
     axes: Axes,
@@ -132,18 +129,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         rotation: args.axes.rotation(),
         ..SessionConfig::default()
     };
-    let arm = if args.arm {
-        Some(Drive {
-            rig: Rig::load(&RigOptions {
-                urdf: args.urdf.clone(),
-                ..RigOptions::default()
-            })?,
-            config: session,
-            link: link.clone(),
-        })
-    } else {
-        None
-    };
+    let arm = args.arm.then(|| args.driving.drive(&session, &link));
+    let arm = arm.transpose()?;
     let plan = Plan {
         sets: &sets,
         off_model: &off_model,

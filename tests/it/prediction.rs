@@ -166,8 +166,8 @@ fn rounded(model: &Model) -> Model {
 #[derive(Default)]
 struct Scores {
     squared: BTreeMap<&'static str, Vec<f64>>,
-    /// At every knot the predictions judged, and those whose truth was within the region of 90 %.
-    judged: [[u32; 2]; 24],
+    /// At every knot the predictions judged, and those whose truth was within the region of 50, 90 and 95 %.
+    judged: [[u32; 4]; 24],
 }
 
 impl Scores {
@@ -182,10 +182,15 @@ impl Scores {
         simple.into_iter().fold(f64::INFINITY, f64::min)
     }
 
+    /// The shares of truths within the regions that are to hold 50, 90 and 95 %.
+    fn held(&self, knot: usize) -> [f64; 3] {
+        let [judged, within @ ..] = self.judged[knot - 1];
+        within.map(|n| f64::from(n) / f64::from(judged))
+    }
+
     /// The share of truths within the region that is to hold 90 %.
     fn covered(&self, knot: usize) -> f64 {
-        let [judged, within] = self.judged[knot - 1];
-        f64::from(within) / f64::from(judged)
+        self.held(knot)[1]
     }
 
     fn ratio(&self, name: &str, knot: usize) -> f64 {
@@ -242,6 +247,9 @@ fn reach_m(demos: &[Demonstration]) -> f64 {
     (most - least).norm()
 }
 
+/// The 50, 90 and 95 % quantiles of χ² with three degrees of freedom.
+const REGIONS: [f64; 3] = [2.366, 6.251, 7.815];
+
 /// Scores every expert, and what the session would have sent.
 fn score(model: &Model, reach_m: f64, test: &Demonstration, scores: &mut Scores) {
     let end_s = test.last().t_s + 1e-9;
@@ -273,8 +281,11 @@ fn score(model: &Model, reach_m: f64, test: &Demonstration, scores: &mut Scores)
             let [xx, xy, xz, yy, yz, zz] = knot.covariance;
             let covariance = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz);
             let nees = error.dot(&(covariance.try_inverse().unwrap() * error));
-            scores.judged[j - 1][0] += 1;
-            scores.judged[j - 1][1] += u32::from(nees < 6.251);
+            let [judged, within @ ..] = &mut scores.judged[j - 1];
+            *judged += 1;
+            for (within, region) in within.iter_mut().zip(REGIONS) {
+                *within += u32::from(nees < region);
+            }
         }
     }
 }
@@ -292,15 +303,15 @@ fn report(set: &str, scores: &Scores) {
 /// The knots at which predictions are judged: 100, 200 and 300 ms.
 const JUDGED: [usize; 3] = [3, 6, 9];
 
-/// Ratios to hold at 100, 200 and 300 ms that the mixture and what the session sends must reach within 2 %; returns the
-/// latter. Fused, the same prediction may not be worse than the best that needs no model by more than 5 %, and its region of 90 % holds 80 to 99.5 %.
+/// Ratios to hold at 100, 200 and 300 ms that the mixture and what the session sends must reach within 1 %; returns the
+/// latter. Fused, the same prediction may not be worse than the best that needs no model by more than 5 %, and its region of 90 % holds 82 to 98.5 %.
 fn must_reach(set: &str, scores: &Scores, mixture: [f64; 3], fused: [f64; 3]) -> [f64; 3] {
     report(set, scores);
     for (name, bar) in [("gmr", mixture), ("fused", fused)] {
         for (knot, bar) in JUDGED.into_iter().zip(bar) {
             let ratio = scores.ratio(name, knot);
             assert!(
-                ratio < 1.02 * bar,
+                ratio < 1.01 * bar,
                 "{set}, {name}, knot {knot}: {ratio:.3} against {bar}"
             );
         }
@@ -313,8 +324,9 @@ fn must_reach(set: &str, scores: &Scores, mixture: [f64; 3], fused: [f64; 3]) ->
             "{set}, knot {knot}: {ratio:.3} against {simple:.3}"
         );
         let held = scores.covered(knot);
+        println!("{set}, knot {knot}: {held:.3} within the region of 0.9");
         assert!(
-            (0.8..0.995).contains(&held),
+            (0.82..0.985).contains(&held),
             "{set}, knot {knot}: {held:.3} of 0.9"
         );
     }
@@ -338,29 +350,32 @@ fn gestures_are_predicted_better_than_by_the_prototype() {
     }
     let mean = product.map(|p| p.powf(0.25));
     println!("utd_mhad, geometric mean: {mean:.3?}");
+    for (mean, bar) in mean.into_iter().zip([0.372, 0.346, 0.322]) {
+        assert!(mean < 1.01 * bar, "{mean:.3} against {bar}");
+    }
 }
 
 /// Of the mixture alone, and fused.
 const GESTURES: [(&str, [[f64; 3]; 2]); 5] = [
     (
         "utd_mhad/a03_wave",
-        [[0.388, 0.360, 0.348], [0.389, 0.358, 0.347]],
+        [[0.386, 0.358, 0.346], [0.388, 0.358, 0.347]],
     ),
     (
         "utd_mhad/a01_swipe_left",
-        [[0.380, 0.322, 0.284], [0.378, 0.329, 0.289]],
+        [[0.378, 0.320, 0.281], [0.378, 0.329, 0.289]],
     ),
     (
         "utd_mhad/a09_circle_cw",
-        [[0.322, 0.307, 0.288], [0.317, 0.309, 0.289]],
+        [[0.319, 0.305, 0.283], [0.317, 0.309, 0.289]],
     ),
     (
         "utd_mhad/a15_tennis_swing",
-        [[0.415, 0.388, 0.370], [0.411, 0.387, 0.367]],
+        [[0.409, 0.383, 0.365], [0.411, 0.387, 0.367]],
     ),
     (
         "kard/a01_horizontal_arm_wave",
-        [[0.508, 0.485, 0.507], [0.496, 0.483, 0.510]],
+        [[0.504, 0.481, 0.501], [0.496, 0.483, 0.510]],
     ),
 ];
 
@@ -393,7 +408,7 @@ fn a_smooth_task_is_recognised_and_its_mixture_beats_the_straight_line() {
         return;
     };
     let scores = evaluate(&by_person(&folder), 3, false);
-    must_reach(set, &scores, [0.065, 0.087, 0.108], [0.060, 0.080, 0.100]);
+    must_reach(set, &scores, [0.064, 0.085, 0.105], [0.058, 0.078, 0.097]);
     for knot in JUDGED {
         assert!(scores.ratio("gmr", knot) < scores.ratio("cv", knot));
     }
@@ -441,7 +456,7 @@ fn off_the_model_nothing_is_worse_than_standing_still_by_a_tenth() {
                 let (ratio, simple) = (together.ratio("fused", knot), together.simple(knot));
                 println!("{learned} on {set}, knot {knot}: {ratio:.3}, best simple {simple:.3}");
                 assert!(
-                    ratio < 1.3 * simple,
+                    ratio < 1.2 * simple,
                     "{learned} on {set}: {ratio:.3}, {simple:.3}"
                 );
             }
@@ -450,6 +465,52 @@ fn off_the_model_nothing_is_worse_than_standing_still_by_a_tenth() {
     for knot in JUDGED {
         let held = all.covered(knot);
         println!("knot {knot}: {held:.3} within the region of 0.9");
-        assert!(held > 0.8, "knot {knot}: {held:.3}");
+        assert!(held > 0.9, "knot {knot}: {held:.3}");
+    }
+}
+
+/// What the regions hold where the other tests do not look: on the smooth sets, on motion that nobody has a skill of, and on the
+/// same people's other gestures. Between 100 and 300 ms, of 90 %.
+#[test]
+fn regions_hold_nearly_what_they_say() {
+    for (set, least) in [
+        ("robottasks/openbox", 0.85),
+        ("helloworld/e", 0.8),
+        ("helloworld/h", 0.8),
+        ("helloworld/l", 0.8),
+        ("vr_hvr_ik/free_arm", 0.78),
+    ] {
+        let Some(folder) = needs(&format!("data/demos/{set}")) else {
+            return;
+        };
+        holds(set, &evaluate(&by_person(&folder), 3, false), least);
+    }
+    let gestures = GESTURES.map(|(set, _)| set);
+    for learned in &gestures[..4] {
+        let Some(folder) = needs(&format!("data/demos/{learned}")) else {
+            return;
+        };
+        let mut scores = Scores::default();
+        for mut person in by_person(&folder) {
+            person.truncate(3);
+            let name = person[0].name().to_owned();
+            let (_, who) = name.split_once('_').unwrap();
+            let model = train(&person, &[], &PredictorOptions::default(), 0, &mut |_| ()).unwrap();
+            for other in gestures[..4].iter().filter(|set| *set != learned) {
+                for group in by_person(&data().join("data/demos").join(other)) {
+                    let own = group.iter().filter(|d| d.name().ends_with(who));
+                    own.for_each(|test| score(&model, reach_m(&person), test, &mut scores));
+                }
+            }
+        }
+        holds(&format!("not {learned}"), &scores, 0.8);
+    }
+}
+
+fn holds(set: &str, scores: &Scores, least: f64) {
+    for knot in JUDGED {
+        let held = scores.held(knot);
+        println!("{set}, knot {knot}: {held:.3?} within the regions of .5, .9, .95");
+        assert!(held[1] > least, "{set}, knot {knot}: {held:.3?}");
     }
 }

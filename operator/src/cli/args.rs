@@ -229,7 +229,11 @@ impl Axes {
     }
 }
 
-pub(super) fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
+/// The bound that these words name: a share of the way (`0.2way`), a length (`40mm`, `0.04m`) or a multiple of the deviation (`0.6sigma`).
+///
+/// # Errors
+/// What may be written.
+pub fn parse_future_bound(text: &str) -> Result<FutureBound, String> {
     let wrong = || {
         format!(
             "`{text}`: write a share of the way (0.2way), a length (40mm, 0.04m) or a multiple of the deviation (0.6sigma)"

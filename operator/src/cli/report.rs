@@ -79,6 +79,7 @@ pub enum Event {
         skill: Option<String>,
         probability: f64,
         phase: f64,
+        again: bool,
         mono_ns: i64,
     },
     Correction {
@@ -262,6 +263,7 @@ impl Event {
             Self::Refused { reason } if reason == "ClockUnknown" => return None,
             Self::Refused { reason } => format!("the robot declines: {reason}"),
             Self::State { state, cause, .. } => format!("robot: {state} ({cause})"),
+            Self::Recognised { again: true, .. } => return None,
             Self::Recognised {
                 skill: Some(skill),
                 probability,
@@ -500,6 +502,7 @@ pub(super) async fn listen_to(
                     skill,
                     probability,
                     phase,
+                    again,
                 } => {
                     let what = match verdict {
                         Verdict::Resting => "resting",
@@ -512,6 +515,7 @@ pub(super) async fn listen_to(
                         skill,
                         probability,
                         phase,
+                        again,
                         mono_ns: at.0 + epoch.0,
                     }
                 }

@@ -21,7 +21,7 @@ mod foretold;
 mod known;
 mod phase;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 pub mod trial;
 
 use nalgebra::Vector3;

@@ -19,7 +19,7 @@ use crate::learn::{LearnOptions, PredictorOptions, learn_skill};
 const REST_S: f64 = 0.4;
 
 /// A gesture drawn with a phase that starts and stops smoothly, never twice alike, sampled at `rate_hz`.
-fn perform(gesture: &str, seed: u64, rate_hz: f64) -> (f64, Vec<Sample>) {
+pub(crate) fn perform(gesture: &str, seed: u64, rate_hz: f64) -> (f64, Vec<Sample>) {
     let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
     let mut about = |v: f64, share: f64| v * (1.0 + rng.random_range(-share..share));
     let (size, duration_s) = (about(0.3, 0.1), about(2.0, 0.12));
@@ -66,7 +66,7 @@ fn quick() -> LearnOptions {
 }
 
 /// Three skills, each learned from four performances (seeds 0 to 3).
-fn skills() -> &'static [Skill] {
+pub(crate) fn skills() -> &'static [Skill] {
     static SKILLS: OnceLock<Vec<Skill>> = OnceLock::new();
     SKILLS.get_or_init(|| {
         ["circle", "push", "wipe"]

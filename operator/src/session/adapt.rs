@@ -78,12 +78,19 @@ const REST: f64 = 0.01;
 /// A hand that turns less than this lately is at rest, rad.
 const REST_RAD: f64 = 0.01;
 
-/// The region that is to hold `1 − MISSED` of what happens: 90 % quantile of χ² with three degrees of freedom.
+/// The region that is to hold 90 % of what happens: that quantile of χ² with three degrees of freedom. The factor stands where the
+/// misses, each counted by how far it missed, are this share.
 const REGION: f64 = 6.251;
-const MISSED: f64 = 0.1;
+const MISSED: f64 = 0.11;
 
-/// By how much the logarithm of the covariance's factor moves in a frame in which every region is missed.
-const WIDENING: f64 = 0.5;
+/// By how much the logarithm of the covariance's factor moves in a frame in which every region is just missed.
+const WIDENING: f64 = 0.45;
+
+/// What is missed by far counts for more: by this much for every e-fold of the squared distance, …
+const FAR: f64 = 0.7;
+
+/// … up to so many of them.
+const FARTHEST: f64 = 3.0;
 
 /// ln 2¹⁶.
 const MOST_LN_INFLATION: f64 = 11.09;
@@ -212,8 +219,6 @@ pub struct Adaptation<C: Course> {
     rest: f64,
     /// Mean squared errors at each knot that the calibration expects, in all axes; none without a model.
     calibrated: Option<[[f64; WEIGHTED + 1]; MAX_KNOTS]>,
-    /// Where the experts are judged for each band's weights.
-    judged: [usize; BAND_KNOTS.len()],
     /// There was a model to predict the newest sample's future with.
     learned: bool,
     records: [Record; BAND_KNOTS.len()],
@@ -257,7 +262,6 @@ impl<C: Course> Adaptation<C> {
             gain: gain.clamp(0.0, 1.0),
             rest,
             calibrated: start.map(at),
-            judged: BAND_KNOTS,
             learned: start.is_some(),
             records: [Record::default(); BAND_KNOTS.len()],
             familiar: None,
@@ -275,22 +279,9 @@ impl<C: Course> Adaptation<C> {
         Self { rested_s, ..self }
     }
 
-    /// What is sent will be used up to about `horizon_s` ahead. Beyond the last of [`BAND_KNOTS`] its weights hold, and are found there.
-    pub fn used_at(&mut self, horizon_s: f64) {
-        let knot = (horizon_s / KNOT_SPACING_S).round() as usize;
-        let [.., last] = &mut self.judged;
-        let [.., least] = BAND_KNOTS;
-        let knot = knot.clamp(least, MAX_KNOTS);
-        // A delay that trembles is no other horizon.
-        if knot.abs_diff(*last) > 1 {
-            *last = knot;
-            self.records[BAND_KNOTS.len() - 1] = Record::default();
-        }
-    }
-
     /// Mean squared errors that the calibration expects where this band is judged.
     fn expected(&self, band: usize) -> Option<[f64; WEIGHTED + 1]> {
-        Some(self.calibrated.as_ref()?[self.judged[band] - 1])
+        Some(self.calibrated.as_ref()?[BAND_KNOTS[band] - 1])
     }
 
     /// The numbers that travel, for a prediction from `hand`.
@@ -332,7 +323,7 @@ impl<C: Course> Adaptation<C> {
         };
         let ahead = Ahead::fused(&experts, &params);
         let unfamiliar = 1.0 - experts.familiarity.powi(VERDICT_POWER);
-        let said = self.judged.map(|knot| {
+        let said = BAND_KNOTS.map(|knot| {
             let knot = knot.min(experts.count);
             let fused = &ahead.knots[knot];
             let [xx, xy, xz, yy, yz, zz] = fused.covariance;
@@ -371,9 +362,14 @@ impl<C: Course> Adaptation<C> {
                 }
                 record.squared[WEIGHTED] += pending.weight * moved.norm_squared();
                 let e = said.fused - moved;
-                let missed = e.dot(&(said.information * e)) > REGION * self.ln_inflation.exp();
+                let out = e.dot(&(said.information * e)) / (REGION * self.ln_inflation.exp());
+                let missed = if out > 1.0 {
+                    1.0 + FAR * out.ln().min(FARTHEST)
+                } else {
+                    0.0
+                };
                 let step = WIDENING * pending.frames / BAND_KNOTS.len() as f64;
-                self.ln_inflation += step * (f64::from(u8::from(missed)) - MISSED);
+                self.ln_inflation += step * (missed - MISSED);
             }
         }
         self.ln_inflation = self
@@ -425,8 +421,7 @@ impl<C: Course> Adaptation<C> {
             let unknown = match nearer {
                 None => [UNKNOWN; WEIGHTED + 1],
                 Some(errors) => {
-                    let farther = self.judged[band] as f64 / BAND_KNOTS[band] as f64;
-                    let grown = |e: f64| (e * GROWTH[band - 1] * farther).min(1e4);
+                    let grown = |e: f64| (e * GROWTH[band - 1]).min(1e4);
                     let [mixture, generic, straight, hold] = errors;
                     [grown(mixture), grown(generic), grown(straight), hold].map(|e| CASCADE * e)
                 }

@@ -155,12 +155,6 @@ impl Mirror {
         self.turns.set_gain(gain);
     }
 
-    /// What is sent from now on is used up to about this far ahead, s.
-    pub(super) fn used_at(&mut self, horizon_s: f64) {
-        self.places.used_at(horizon_s);
-        self.turns.used_at(horizon_s);
-    }
-
     /// By what the hand is predicted now, place and orientation.
     pub(super) fn params(&self) -> (Params, Params) {
         let turn = self.hand.turn.as_ref();

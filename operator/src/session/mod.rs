@@ -37,7 +37,7 @@ use telemime_protocol::wire::v1::{
     Reception as Told, Refusal, RobotState, ServoTimes,
 };
 
-use crate::recognise::{Recogniser, Verdict};
+use crate::recognise::{Recogniser, Recognition, Verdict};
 
 pub use config::{
     FutureBound, HandSample, MAX_LEASE_S, MAX_SILENCE_S, SessionConfig, default_scale,
@@ -51,6 +51,9 @@ use gate::{Gate, Taken};
 use hand::{Hand, Interval};
 use mirror::Mirror;
 use pace::{Pace, REPEAT_S};
+
+/// What is recognised is said again when its probability, or how far it has got, has changed by this much.
+const RECOGNISED_STEP: f64 = 0.05;
 
 /// While an emergency stop is not confirmed, it is repeated at this interval, s.
 const STOP_REPEAT_S: f64 = 0.01;
@@ -91,7 +94,8 @@ pub struct Session {
     heard: Option<VecDeque<(Option<u32>, HandSample)>>,
     recogniser: Option<Recogniser>,
     external: Option<ExternalClock>,
-    verdict: Option<Verdict>,
+    /// What was last said of what the hand does.
+    recognised: Option<Recognition>,
     activity: Activity,
     engagement: u32,
     seq: u32,
@@ -142,7 +146,7 @@ impl Session {
             heard: None,
             recogniser: None,
             external: None,
-            verdict: None,
+            recognised: None,
             activity: Activity::Nothing,
             engagement: 0,
             seq: 0,
@@ -174,8 +178,8 @@ impl Session {
         self
     }
 
-    /// Reports with [`Event::Recognised`] which of these skills the hand performs, whenever that changes. It
-    /// changes nothing else.
+    /// Reports with [`Event::Recognised`] which of these skills the hand performs, whenever that changes, and how far it
+    /// has got in steps of a twentieth. It changes nothing else.
     #[must_use]
     pub fn watched_by(mut self, recogniser: Option<Recogniser>) -> Self {
         self.recogniser = recogniser;
@@ -309,8 +313,6 @@ impl Session {
             }
             self.counters.samples += 1;
         }
-        // Until the next message, on average: half a silence longer.
-        mirror.used_at(self.delay_s + lag_s + 0.5 * self.config.max_silence_s);
         self.counters.knots += mirror.take(&sample, taken, hand, skill);
         let backlog = mirror.backlog();
         let arrival = now.offset_by_secs(network_s + lag_s);
@@ -355,10 +357,17 @@ impl Session {
         let Some(seen) = recogniser.take(&hand.place) else {
             return;
         };
-        if self.verdict == Some(seen.verdict) {
+        let last = self.recognised.as_ref();
+        let again = last.is_some_and(|last| last.verdict == seen.verdict);
+        // Where no skill is named, what fits best is nothing to show.
+        let named = matches!(seen.verdict, Verdict::Skill(_));
+        let news = |last: &Recognition| {
+            let moved = |was: f64, is: f64| (was - is).abs() >= RECOGNISED_STEP;
+            named && (moved(last.probability, seen.probability) || moved(last.phase, seen.phase))
+        };
+        if again && !last.is_some_and(news) {
             return;
         }
-        self.verdict = Some(seen.verdict);
         let skill = match seen.verdict {
             Verdict::Skill(index) => recogniser.names().get(index).cloned(),
             Verdict::Resting | Verdict::Unknown | Verdict::Undecided => None,
@@ -368,7 +377,9 @@ impl Session {
             skill,
             probability: seen.probability,
             phase: seen.phase,
+            again,
         });
+        self.recognised = Some(seen);
     }
 
     /// Asks the robot to follow the hand; refused here if no sample has been taken yet, or a stop is under way.

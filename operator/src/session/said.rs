@@ -49,7 +49,7 @@ pub enum Event {
     Refused(Refusal),
     /// The robot's state changed.
     State(RobotState, Cause),
-    /// The hand does something else than before; for display.
+    /// The hand does something else than before, or is surer or farther on by a twentieth than was said last; for display.
     Recognised {
         /// What.
         verdict: Verdict,
@@ -59,6 +59,8 @@ pub enum Event {
         probability: f64,
         /// How far it has got, in [0, 1].
         phase: f64,
+        /// The verdict is the one that was said last.
+        again: bool,
     },
     /// A hand takes hold of what is played, or lets it go.
     Correction(Change),

@@ -76,6 +76,6 @@ impl Session {
     /// As [`Session::watched_by`], from now on.
     pub fn watch_by(&mut self, recogniser: Option<Recogniser>) {
         self.recogniser = recogniser;
-        self.verdict = None;
+        self.recognised = None;
     }
 }

@@ -347,6 +347,7 @@ impl Live {
                 skill,
                 probability,
                 phase,
+                again: _,
             } => {
                 let what = match verdict {
                     Verdict::Resting => "resting",

@@ -4,7 +4,7 @@ use super::*;
 use telemime_protocol::predict::{Forecast, checksum};
 use telemime_protocol::wire::v1::model_tag;
 
-use crate::recognise::{RecogniseOptions, Recogniser, Verdict};
+use crate::recognise::{self, RecogniseOptions, Recogniser, Verdict};
 
 fn bound(bound_m: f64) -> SessionConfig {
     SessionConfig {
@@ -73,6 +73,43 @@ fn what_the_hand_does_is_told_when_it_changes_and_changes_nothing_else() {
     // A hand that flies off is none of the skills; it is said once.
     assert_eq!(told, [(Verdict::Resting, None), (Verdict::Unknown, None)]);
     assert_eq!(run(false), (Vec::new(), datagrams, control));
+}
+
+#[test]
+fn what_is_recognised_follows_the_hand_in_steps_of_a_twentieth() {
+    let skills = recognise::tests::skills();
+    let recogniser = Recogniser::new(skills, RecogniseOptions::default()).unwrap();
+    let mut bench = Bench::ready(bound(0.02), None);
+    bench.session = bench.session.watched_by(Some(recogniser));
+    let (_, samples) = recognise::tests::perform("circle", 11, 1e3 / 33.0);
+    for sample in &samples {
+        bench.sample(sample.position);
+    }
+    let told = bench.events.iter().filter_map(|e| match e {
+        Event::Recognised {
+            verdict,
+            probability,
+            phase,
+            again,
+            ..
+        } => Some((*verdict, *probability, *phase, *again)),
+        _ => None,
+    });
+    let told: Vec<_> = told.collect();
+    for (last, next) in told.iter().zip(&told[1..]) {
+        let (same, moved) = (
+            last.0 == next.0,
+            (last.1 - next.1).abs().max((last.2 - next.2).abs()),
+        );
+        assert_eq!(next.3, same, "{told:?}");
+        assert!(!same || moved >= 0.05, "{moved}");
+    }
+    let circle = told.iter().filter(|t| t.0 == Verdict::Skill(0));
+    let phases: Vec<f64> = circle.map(|t| t.2).collect();
+    let (first, last) = (phases[0], phases[phases.len() - 1]);
+    assert!(first < 0.5 && last > 0.9, "{phases:?}");
+    assert!((8..=25).contains(&phases.len()), "{phases:?}");
+    assert!(told.len() < samples.len() / 2, "{} said", told.len());
 }
 
 #[test]

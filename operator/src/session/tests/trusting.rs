@@ -75,19 +75,3 @@ fn what_abrupt_motion_taught_does_not_drown_what_smooth_motion_shows() {
     let [near, ..] = trust.params(&hand).weights;
     assert!(near[2] > 0.9, "{near:?}");
 }
-
-#[test]
-fn the_last_weights_are_found_where_what_is_sent_is_used() {
-    // To and fro, a second each way: 0.4 s ahead it mostly still goes on, 0.8 s ahead it has mostly turned.
-    let zigzag = |t_s: f64| Vector3::x() * (0.2 * (1.0 - (t_s % 2.0 - 1.0).abs()));
-    let weights = |horizon_s: f64| {
-        let mut trust = Adaptation::of_places(1.0, None, 0.2);
-        trust.used_at(horizon_s);
-        let (hand, trust) = follow(trust, None, 180, zigzag);
-        trust.params(&hand).weights
-    };
-    let [near, far] = [0.2, 0.8].map(weights);
-    assert_eq!(near[..2], far[..2]);
-    assert!(near[2][2] > 0.6, "{near:?}");
-    assert!(far[2][2] < 0.3, "{far:?}");
-}
