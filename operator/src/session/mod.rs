@@ -4,6 +4,7 @@
 //! both are empty, then [`Session::poll_timeout`] for when to call [`Session::handle_timeout`].
 
 pub mod adapt;
+mod ask;
 mod beside;
 mod config;
 mod correct;
@@ -14,6 +15,7 @@ mod mirror;
 mod pace;
 mod path;
 mod said;
+mod speak;
 #[cfg(test)]
 mod tests;
 mod usual;
@@ -24,17 +26,14 @@ use std::sync::Arc;
 
 use telemime_endpoint::reception::Reception;
 use telemime_endpoint::tally::Tally;
-use telemime_protocol::checkpoint::PosePlan;
 use telemime_protocol::checkpoint::path::PathBounds;
 use telemime_protocol::predict::Params;
 use telemime_protocol::skill::Skill;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::Version;
 use telemime_protocol::wire::arm::WireArm;
-use telemime_protocol::wire::codec;
 use telemime_protocol::wire::v1::{
-    Drive, Engage, ExternalClock, Info, Message, OperatorControl, OperatorDatagram, PathTail,
-    Reception as Told, Refusal, RobotState, ServoTimes,
+    ExternalClock, Info, OperatorControl, Reception as Told, RobotState, ServoTimes,
 };
 
 use crate::recognise::{Recogniser, Recognition, Verdict};
@@ -50,13 +49,10 @@ use correct::Correction;
 use gate::{Gate, Taken};
 use hand::{Hand, Interval};
 use mirror::Mirror;
-use pace::{Pace, REPEAT_S};
+use pace::Pace;
 
 /// What is recognised is said again when its probability, or how far it has got, has changed by this much.
 const RECOGNISED_STEP: f64 = 0.05;
-
-/// While an emergency stop is not confirmed, it is repeated at this interval, s.
-const STOP_REPEAT_S: f64 = 0.01;
 
 /// In play the operator speaks at least this often, s: a lost go must not make the arm coast, and it costs little.
 pub const GO_S: f64 = 0.1;
@@ -341,15 +337,6 @@ impl Session {
         now.offset_by_secs(self.delay_s + lag_s)
     }
 
-    /// Within the shortest interval the news waits, and what is then said is the newest.
-    fn speak_soon(&mut self, now: Stamp) {
-        self.news = true;
-        self.urgent = now.secs_since(self.last_sent) < self.interval_s;
-        if !self.urgent {
-            self.speak(now);
-        }
-    }
-
     fn recognise(&mut self, hand: &Hand) {
         let Some(recogniser) = &mut self.recogniser else {
             return;
@@ -382,133 +369,6 @@ impl Session {
         self.recognised = Some(seen);
     }
 
-    /// Asks the robot to follow the hand; refused here if no sample has been taken yet, or a stop is under way.
-    pub fn engage(&mut self, now: Stamp) {
-        if self.refuses() {
-            return;
-        }
-        let Some(hand) = self.hand else {
-            self.events
-                .push_back(Event::Refused(Refusal::StaleReference));
-            return;
-        };
-        let skill = self.skill.as_deref().filter(|_| self.model_stored);
-        let bounds = self.path_bounds(hand.turn.is_some());
-        let path = (bounds, self.interval.us());
-        let Ok(mirror) = Mirror::new(hand, path, self.config.gain, skill) else {
-            self.events.push_back(Event::Refused(Refusal::BadMapping));
-            return;
-        };
-        let Some(drive) = mirror.reference(skill) else {
-            self.events
-                .push_back(Event::Refused(Refusal::StaleReference));
-            return;
-        };
-        self.activity = Activity::Mirror(Box::new(mirror));
-        self.request(now, drive);
-        self.last_sent = now;
-    }
-
-    /// Sends a motion and plays it as soon as the robot has it. With the skill's `leeway` the hand may correct it:
-    /// [`Session::handle_sample`], [`Session::let_go`].
-    pub fn play(&mut self, plan: &PosePlan, leeway: Option<&Leeway>) {
-        if self.refuses() {
-            return;
-        }
-        let correction = match leeway.map(|leeway| (plan.curve(), leeway)) {
-            Some((Ok(curve), leeway)) => Some(Box::new(Correction::new(
-                curve,
-                leeway.clone(),
-                &self.config,
-            ))),
-            Some((Err(_), _)) => {
-                self.events.push_back(Event::Refused(Refusal::BadPlan));
-                return;
-            }
-            None => None,
-        };
-        self.plans += 1;
-        self.activity = Activity::Play {
-            plan: self.plans,
-            engaged: false,
-            correction,
-        };
-        self.control(&OperatorControl::Plan {
-            id: self.plans,
-            bytes: codec::encode(plan),
-        });
-    }
-
-    /// Lets go of the clutch, and sees to it that the robot holds the path up to the newest sample.
-    pub fn release(&mut self) {
-        if let Activity::Mirror(mirror) = &mut self.activity {
-            self.counters.knots += mirror.close();
-            while let Activity::Mirror(mirror) = &mut self.activity
-                && let Some(tail) = mirror.tail()
-            {
-                self.path(tail);
-            }
-        }
-        if !matches!(self.activity, Activity::Nothing) {
-            self.control(&OperatorControl::Release {
-                engagement: self.engagement,
-            });
-            self.end_activity();
-        }
-    }
-
-    /// Whether anything is driven, or asked for and not declined yet.
-    pub fn is_driving(&self) -> bool {
-        !matches!(self.activity, Activity::Nothing)
-    }
-
-    /// Emergency stop: on the stream, and by datagram until the robot says it has stopped.
-    pub fn stop(&mut self, now: Stamp) {
-        // Before a model that has waited for the end of what was driven: it may take seconds.
-        self.control(&OperatorControl::EmergencyStop);
-        self.end_activity();
-        self.next_stop = Some(now);
-    }
-
-    /// Whether a stop was demanded that the robot has not confirmed.
-    pub fn stop_is_unconfirmed(&self) -> bool {
-        self.next_stop.is_some()
-    }
-
-    /// Leaves the latched stop; false if there is one that the robot has not confirmed: nobody knows yet what
-    /// would be left.
-    pub fn reset(&mut self) -> bool {
-        if self.stop_is_unconfirmed() {
-            return false;
-        }
-        let changes = self.changes;
-        self.control(&OperatorControl::Reset { changes });
-        true
-    }
-
-    /// Ends the session.
-    pub fn goodbye(&mut self) {
-        self.release();
-        self.control(&OperatorControl::Goodbye);
-    }
-
-    /// Something is due.
-    pub fn handle_timeout(&mut self, now: Stamp) {
-        if self.next_stop.is_some_and(|due| now >= due) {
-            self.next_stop = Some(now.offset_by_secs(STOP_REPEAT_S));
-            self.datagram(&OperatorDatagram::Stop { epoch: self.epoch });
-        }
-        if self.next_word().is_some_and(|due| now >= due) {
-            self.news = true;
-            self.speak(now);
-        } else if self.repeat.is_some_and(|due| now >= due) {
-            self.speak(now);
-        }
-        if self.next_look().is_some_and(|due| now >= due) {
-            self.look_after(now);
-        }
-    }
-
     /// What to send next.
     pub fn poll_output(&mut self) -> Option<Output> {
         self.outputs.pop_front()
@@ -517,29 +377,6 @@ impl Session {
     /// What has happened since the last call.
     pub fn poll_event(&mut self) -> Option<Event> {
         self.events.pop_front()
-    }
-
-    /// When to call [`Session::handle_timeout`], and for what.
-    pub fn poll_timeout(&self) -> Option<(Stamp, &'static str)> {
-        let stop = self.next_stop.map(|due| (due, "repeat the emergency stop"));
-        let word = self
-            .next_word()
-            .map(|due| (due, "confirm before the silence grows too long"));
-        let look = self
-            .next_look()
-            .map(|due| (due, "see what the hand makes of the plan"));
-        let repeat = self.repeat.map(|due| (due, "say again what may be lost"));
-        [stop, word, look, repeat]
-            .into_iter()
-            .flatten()
-            .min_by_key(|w| w.0)
-    }
-
-    fn next_look(&self) -> Option<Stamp> {
-        match &self.activity {
-            Activity::Play { correction, .. } => correction.as_ref()?.due(),
-            _ => None,
-        }
     }
 
     /// What the hand did in the engagement that ended last, glitches left out; empty if there was none.
@@ -587,121 +424,5 @@ impl Session {
             self.driven = mirror.into_driven();
         }
         self.adopt();
-    }
-
-    fn next_word(&self) -> Option<Stamp> {
-        match self.activity {
-            Activity::Nothing | Activity::Play { engaged: false, .. } => None,
-            Activity::Mirror(_) => Some(self.last_sent.offset_by_secs(if self.urgent {
-                self.interval_s
-            } else {
-                self.config.max_silence_s
-            })),
-            Activity::Play { engaged: true, .. } => Some(self.last_sent.offset_by_secs(
-                self.config.max_silence_s.min(if self.urgent {
-                    self.interval_s
-                } else {
-                    self.interval_s.max(GO_S)
-                }),
-            )),
-        }
-    }
-
-    /// Sends the newest there is, whatever drives.
-    fn speak(&mut self, now: Stamp) {
-        self.last_sent = now;
-        self.urgent = false;
-        self.interval_s = self.pace.interval_s(now);
-        let again = std::mem::take(&mut self.news) && self.pace.repeats();
-        self.repeat = again.then(|| now.offset_by_secs(REPEAT_S));
-        self.seq += 1;
-        let lease_ms = self.config.lease_ms();
-        let network_s = self.network_delay_s();
-        let ahead = self.ahead(now);
-        let datagram = match &mut self.activity {
-            Activity::Nothing => return,
-            Activity::Play { correction, .. } => {
-                let told = correction.as_mut().and_then(|c| c.tell(now, ahead));
-                if let Some((_, bent)) = told {
-                    self.events.push_back(Event::Bent(bent));
-                }
-                OperatorDatagram::Go {
-                    epoch: self.epoch,
-                    engagement: self.engagement,
-                    seq: self.seq,
-                    t_us: now.0 / 1000,
-                    lease_ms,
-                    bend: told.map(|(wire, _)| wire),
-                }
-            }
-            Activity::Mirror(mirror) => {
-                let skill = self.skill.as_deref().filter(|_| self.model_stored);
-                let Some(mut motion) = mirror.motion(skill, (now, network_s), self.pace.copies())
-                else {
-                    return;
-                };
-                motion.epoch = self.epoch;
-                motion.engagement = self.engagement;
-                motion.seq = self.seq;
-                motion.lease_ms = lease_ms;
-                OperatorDatagram::Motion(motion)
-            }
-        };
-        self.counters.messages += 1;
-        self.say(&datagram, true);
-    }
-
-    fn request(&mut self, now: Stamp, drive: Drive) {
-        self.engagement += 1;
-        self.before = Some(self.counters);
-        let rotation = self.config.rotation.as_ref();
-        let turns = matches!(&drive, Drive::Mirror { pose, .. } if pose.turn.is_some());
-        let bounds = self.path_bounds(turns);
-        let engage = Engage {
-            engagement: self.engagement,
-            t_us: now.0 / 1000,
-            drive,
-            scale: self.scale().unwrap_or(0.1) as f32,
-            rotation: [
-                rotation.w as f32,
-                rotation.i as f32,
-                rotation.j as f32,
-                rotation.k as f32,
-            ],
-            path_bound_um: bounds.place_um(),
-            path_turn_bound_urad: bounds.turn_urad(),
-            sample_us: self.interval.us(),
-            lease_ms: self.config.lease_ms(),
-        };
-        self.control(&OperatorControl::Engage(engage));
-    }
-
-    fn refuses(&mut self) -> bool {
-        let stopping = self.stop_is_unconfirmed();
-        if stopping {
-            self.events.push_back(Event::Refused(Refusal::Stopped));
-        }
-        stopping
-    }
-
-    fn path(&mut self, tail: PathTail) {
-        let engagement = self.engagement;
-        self.control(&OperatorControl::Path(PathTail { engagement, ..tail }));
-    }
-
-    fn control(&mut self, message: &OperatorControl) {
-        let bytes = message.encode();
-        self.tally.operator_control(Some(message), bytes.len());
-        self.outputs.push_back(Output::Control(bytes));
-    }
-
-    fn datagram(&mut self, message: &OperatorDatagram) {
-        self.say(message, false);
-    }
-
-    fn say(&mut self, message: &OperatorDatagram, motion: bool) {
-        let bytes = self.version.encode_operator_datagram(message);
-        self.tally.operator_datagram(Some(message), bytes.len());
-        self.outputs.push_back(Output::Datagram { bytes, motion });
     }
 }

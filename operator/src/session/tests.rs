@@ -1,15 +1,15 @@
 use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
-use telemime_protocol::checkpoint::select;
-use telemime_protocol::skill::example;
-use telemime_protocol::wire::v1::{ModelId, Motion};
-
-use telemime_protocol::skill::Stats;
-use telemime_protocol::wire::DecodeError;
+use telemime_protocol::checkpoint::{PosePlan, select};
+use telemime_protocol::skill::{Stats, example};
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::turn::WireRotation;
-use telemime_protocol::wire::v1::{Cause, RobotControl, RobotDatagram, Telemetry};
+use telemime_protocol::wire::v1::{
+    Cause, Drive, Engage, Message, ModelId, Motion, OperatorDatagram, Refusal, RobotControl,
+    RobotDatagram, Telemetry,
+};
+use telemime_protocol::wire::{DecodeError, codec};
 
 use super::*;
 
