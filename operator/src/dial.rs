@@ -17,7 +17,7 @@ use telemime_protocol::wire::hello::{Answer, RejectCode};
 use telemime_protocol::wire::{Version, Versions};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
-use tokio::time::{Instant, sleep, sleep_until, timeout};
+use tokio::time::{Instant, sleep_until, timeout};
 
 /// Attempts begin this far apart …
 pub const REDIAL: Duration = Duration::from_millis(250);
@@ -281,7 +281,7 @@ async fn connect(
             .close_reason()
             .map_or_else(|| DialError::Again(e.to_string()), |lost| failed(&lost)),
     };
-    sleep(pace.hold(connection.rtt())).await;
+    sleep_until(Instant::now() + pace.hold(connection.rtt())).await;
     let mut control = Control::open(&connection).await.map_err(again)?;
     let hello = offered.hello().encode();
     control.write(&hello).await.map_err(again)?;
