@@ -430,19 +430,24 @@ impl Session {
 
     /// Lets go of the clutch, and sees to it that the robot holds the path up to the newest sample.
     pub fn release(&mut self) {
-        if let Activity::Mirror(mirror) = &mut self.activity {
-            self.counters.knots += mirror.close();
-            while let Activity::Mirror(mirror) = &mut self.activity
-                && let Some(tail) = mirror.tail()
-            {
-                self.path(tail);
-            }
-        }
+        self.complete_path();
         if !matches!(self.activity, Activity::Nothing) {
             self.control(&OperatorControl::Release {
                 engagement: self.engagement,
             });
             self.end_activity();
+        }
+    }
+
+    /// Closes the path at the newest sample and hands the stream what the robot does not hold of it.
+    fn complete_path(&mut self) {
+        if let Activity::Mirror(mirror) = &mut self.activity {
+            self.counters.knots += mirror.close();
+        }
+        while let Activity::Mirror(mirror) = &mut self.activity
+            && let Some(tail) = mirror.tail()
+        {
+            self.path(tail);
         }
     }
 
@@ -567,9 +572,12 @@ impl Session {
         }
     }
 
-    /// Nothing is driven any more.
+    /// Nothing is driven any more. However that came about, the robot gets the whole path of what it followed.
     fn end_activity(&mut self) {
         self.repeat = None;
+        if self.before.is_none() {
+            self.complete_path();
+        }
         if let Activity::Mirror(mirror) = std::mem::replace(&mut self.activity, Activity::Nothing)
             && self.before.is_none()
         {
