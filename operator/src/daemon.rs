@@ -40,6 +40,13 @@ pub use said::{DaemonError, Notice, Summary};
 /// A robot that has ended its stream gets this long to say why.
 const LAST_WORDS: Duration = Duration::from_millis(500);
 
+/// Whoever leaves waits this long for the robot to have all that was said, the end of the path among it: four of QUIC's
+/// retransmissions, each after twice the time of the one before, at a round trip of 0.2 s. A dead link ends it sooner.
+const GOODBYE: Duration = Duration::from_secs(5);
+
+/// The same where the robot's key is not trusted any more: nothing is owed to it.
+const SHORT_GOODBYE: Duration = Duration::from_secs(1);
+
 /// Nobody answered for so long: the socket itself may be what is wrong.
 const SOCKET_PATIENCE_S: f64 = 5.0;
 
@@ -281,7 +288,7 @@ impl Daemon {
             }
             // Whoever says stop is not left before the robot says it has.
             if advice == Advice::Finished && !session.stop_is_unconfirmed() {
-                return self.leave(session, link, marks).await;
+                return self.leave(session, link, marks, (&console, GOODBYE)).await;
             }
             if (task.progress() - marks.progress).abs() >= 0.01 {
                 marks.progress = task.progress();
@@ -298,11 +305,11 @@ impl Daemon {
             tokio::select! {
                 biased;
                 () = told(console.quit) => {
-                    let _ = self.leave(session, link, marks).await;
+                    let _ = self.leave(session, link, marks, (&console, GOODBYE)).await;
                     return End::Quit;
                 }
                 standing = self.withdrawn(key) => {
-                    let _ = self.leave(session, link, marks).await;
+                    let _ = self.leave(session, link, marks, (&console, SHORT_GOODBYE)).await;
                     return End::Lost(match standing {
                         Standing::Revoked => "the robot's key was revoked".into(),
                         Standing::Trusted | Standing::Unknown => "the robot's key is not trusted any more".into(),
@@ -393,15 +400,22 @@ impl Daemon {
         Ok(())
     }
 
-    /// Releases, says goodbye, and waits until the robot has read it.
-    async fn leave(&self, session: &mut Session, link: Link, marks: &mut Marks) -> End {
+    /// Releases, says goodbye, and waits until the robot has it, but no longer than `within`.
+    async fn leave(
+        &self,
+        session: &mut Session,
+        link: Link,
+        marks: &mut Marks,
+        (console, within): (&Console<'_>, Duration),
+    ) -> End {
         session.goodbye();
         let said = self.flush(session, &link, marks);
         let Link {
             connection, writer, ..
         } = link;
-        if said.is_ok() {
-            writer.finish(Duration::from_secs(1)).await;
+        if said.is_err() || !writer.finish(within).await {
+            console
+                .note("the robot has not confirmed the goodbye: it may lack the end of the path");
         }
         // Only now has QUIC sent what it was given; after the release that is no motion any more.
         marks.released = Some(self.meter.counts());

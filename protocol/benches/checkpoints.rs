@@ -3,8 +3,9 @@
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
 use nalgebra::{SVector, Vector3};
+use telemime_protocol::checkpoint::Plan;
 use telemime_protocol::checkpoint::path::{PathDecoder, PathEncoder};
-use telemime_protocol::checkpoint::select::{Effort, bounded_with, counted_with};
+use telemime_protocol::checkpoint::select::{Effort, Selector};
 use telemime_protocol::pose::exp;
 use telemime_protocol::time::Stamp;
 
@@ -30,14 +31,24 @@ fn swing(rate_hz: f64, samples: u32) -> (Vec<f64>, Vec<Vector3<f64>>) {
 #[divan::bench(args = [Effort::Quick, Effort::Brisk, Effort::Thorough])]
 fn selection(bencher: Bencher, effort: Effort) {
     let (t, x) = swing(30.0, 300);
-    bencher.bench(|| bounded_with(&t, &x, black_box(0.002), effort));
+    let mut selector = Selector::new();
+    bencher.bench_local(|| {
+        selector
+            .bounded(&t, &x, black_box(0.002), effort)
+            .map(Plan::len)
+    });
 }
 
 /// 46 of 300 samples in three dimensions.
 #[divan::bench(args = [Effort::Brisk, Effort::Thorough])]
 fn selection_of_a_number(bencher: Bencher, effort: Effort) {
     let (t, x) = swing(30.0, 300);
-    bencher.bench(|| counted_with(&t, &x, black_box(46), effort));
+    let mut selector = Selector::new();
+    bencher.bench_local(|| {
+        selector
+            .counted(&t, &x, black_box(46), effort)
+            .map(Plan::len)
+    });
 }
 
 /// A second of samples at 1 kHz, a sample an item.
@@ -134,7 +145,10 @@ fn live_decoding(bencher: Bencher) {
 #[divan::bench]
 fn plan_evaluation(bencher: Bencher) {
     let (t, x) = swing(30.0, 300);
-    let plan = bounded_with(&t, &x, 0.002, Effort::Quick).expect("a plan");
+    let mut selector = Selector::new();
+    let plan = selector
+        .bounded(&t, &x, 0.002, Effort::Quick)
+        .expect("a plan");
     let curve = plan.spline().expect("a curve");
     bencher.bench(|| curve.eval(black_box(4.321)));
 }

@@ -21,6 +21,7 @@ mod evaluate;
 mod floods;
 mod frames;
 mod gate;
+mod goodbye;
 mod grounds;
 mod horizon;
 mod ingest;

@@ -69,19 +69,24 @@ impl Session {
 
     /// Lets go of the clutch, and sees to it that the robot holds the path up to the newest sample.
     pub fn release(&mut self) {
-        if let Activity::Mirror(mirror) = &mut self.activity {
-            self.counters.knots += mirror.close();
-            while let Activity::Mirror(mirror) = &mut self.activity
-                && let Some(tail) = mirror.tail()
-            {
-                self.path(tail);
-            }
-        }
+        self.complete_path();
         if !matches!(self.activity, Activity::Nothing) {
             self.control(&OperatorControl::Release {
                 engagement: self.engagement,
             });
             self.end_activity();
+        }
+    }
+
+    /// Closes the path at the newest sample and hands the stream what the robot does not hold of it.
+    pub(super) fn complete_path(&mut self) {
+        if let Activity::Mirror(mirror) = &mut self.activity {
+            self.counters.knots += mirror.close();
+        }
+        while let Activity::Mirror(mirror) = &mut self.activity
+            && let Some(tail) = mirror.tail()
+        {
+            self.path(tail);
         }
     }
 

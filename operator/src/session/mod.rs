@@ -415,9 +415,12 @@ impl Session {
         }
     }
 
-    /// Nothing is driven any more.
+    /// Nothing is driven any more. However that came about, the robot gets the whole path of what it followed.
     fn end_activity(&mut self) {
         self.repeat = None;
+        if self.before.is_none() {
+            self.complete_path();
+        }
         if let Activity::Mirror(mirror) = std::mem::replace(&mut self.activity, Activity::Nothing)
             && self.before.is_none()
         {

@@ -151,7 +151,7 @@ const MAX_UNREAD: usize = 256;
 #[derive(Debug)]
 pub struct Writer {
     queue: mpsc::Sender<Vec<u8>>,
-    written: JoinHandle<()>,
+    written: JoinHandle<bool>,
 }
 
 impl Writer {
@@ -178,14 +178,20 @@ impl Writer {
         self.raw(frame::encode(payload, false))
     }
 
-    /// Writes what is queued, ends the stream and waits for the peer to have it, but no longer than `within`.
-    pub async fn finish(self, within: Duration) {
+    /// Writes what is queued, ends the stream and waits for the peer to have it, but no longer than `within`. Says
+    /// whether the peer has it: it acknowledged all, or ended the connection on purpose.
+    pub async fn finish(self, within: Duration) -> bool {
         drop(self.queue);
-        let _ = timeout(within, self.written).await;
+        matches!(timeout(within, self.written).await, Ok(Ok(true)))
     }
 }
 
-async fn write(connection: Connection, mut send: SendStream, mut due: mpsc::Receiver<Vec<u8>>) {
+/// Says whether the peer has it all.
+async fn write(
+    connection: Connection,
+    mut send: SendStream,
+    mut due: mpsc::Receiver<Vec<u8>>,
+) -> bool {
     while let Some(bytes) = due.recv().await {
         let written = if bytes.len() > LONG {
             write_long(&connection, &mut send, &bytes).await
@@ -193,11 +199,17 @@ async fn write(connection: Connection, mut send: SendStream, mut due: mpsc::Rece
             send.write_all(&bytes).await
         };
         if written.is_err() {
-            return;
+            return false;
         }
     }
     let _ = send.finish();
-    let _ = send.stopped().await;
+    match send.stopped().await {
+        Ok(stopped) => stopped.is_none(),
+        Err(_) => matches!(
+            connection.close_reason(),
+            Some(quinn::ConnectionError::ApplicationClosed(_))
+        ),
+    }
 }
 
 /// A message longer than this is a model or a plan.

@@ -47,6 +47,17 @@ impl BitWriter {
         self.golomb(zigzag(n), k);
     }
 
+    /// Begins anew.
+    pub(super) fn clear(&mut self) {
+        self.bytes.clear();
+        self.used = 0;
+    }
+
+    /// The bytes so far, the last one filled up with zeros.
+    pub(super) fn bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+
     /// The bytes, the last one filled up with zeros.
     pub(crate) fn finish(self) -> Vec<u8> {
         self.bytes

@@ -69,30 +69,27 @@ fn mantissa(mut n: u32) -> (u32, u32) {
     (n, tens)
 }
 
-/// How a coordinate is written.
-struct Column {
-    rule: Rule,
-    order: u32,
-    /// How far each point but the first is off what the rule expects, zigzag.
-    off: Vec<u64>,
+/// For each coordinate the first of the cheapest rules, and its lowest order; in `off` how far each point but the first is
+/// off what the last rule tried expects, zigzag.
+fn columns<const D: usize>(points: &[Point<D>], off: &mut Vec<u64>) -> [(Rule, u32); D] {
+    core::array::from_fn(|d| {
+        let mut best = (u64::MAX, (Rule::Hold, 0));
+        for rule in RULES {
+            off.clear();
+            off.extend((1..points.len()).map(|i| off_by(points, i, d, rule)));
+            let (order, bits) = best_order(off);
+            if bits < best.0 {
+                best = (bits, (rule, order));
+            }
+        }
+        best.1
+    })
 }
 
-/// For each coordinate the first of the cheapest rules, and its lowest order.
-fn columns<const D: usize>(points: &[Point<D>]) -> [Column; D] {
-    core::array::from_fn(|d| {
-        let tried = RULES.map(|rule| {
-            let off: Vec<u64> = (1..points.len())
-                .map(|i| {
-                    let (p, expected) = (&points[i], expected(rule, &points[..i], points[i].0, d));
-                    zigzag(i64::from(p.1[d]) - expected)
-                })
-                .collect();
-            let (order, bits) = best_order(&off);
-            (bits, Column { rule, order, off })
-        });
-        let cheapest = tried.into_iter().min_by_key(|(bits, _)| *bits);
-        cheapest.expect("there are rules").1
-    })
+/// How far the point `i` is off what the rule expects, zigzag.
+fn off_by<const D: usize>(points: &[Point<D>], i: usize, d: usize, rule: Rule) -> u64 {
+    let (ticks, x) = &points[i];
+    zigzag(i64::from(x[d]) - expected(rule, &points[..i], *ticks, d))
 }
 
 /// The tick of so many a second, µs.
@@ -115,50 +112,70 @@ fn first_order(step_nm: u32) -> u32 {
     (1_000_000_000 / step_nm.max(1)).max(1).ilog2()
 }
 
+/// Writes plans, one after the other into the same memory.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Packer {
+    w: BitWriter,
+    numbers: Vec<u64>,
+}
+
+impl Packer {
+    /// The bytes of a plan.
+    pub(super) fn pack<const D: usize>(&mut self, grid: Grid, points: &[Point<D>]) -> &[u8] {
+        self.write(grid, points);
+        self.w.bytes()
+    }
+
+    fn write<const D: usize>(&mut self, grid: Grid, points: &[Point<D>]) {
+        let Self { w, numbers } = self;
+        w.clear();
+        w.golomb(points.len() as u64, COUNT_ORDER);
+        let number = |w: &mut BitWriter, n| {
+            let (digits, tens) = mantissa(n);
+            w.golomb(u64::from(digits), MANTISSA_ORDER);
+            w.put(u64::from(tens), 4);
+        };
+        number(w, grid.step_nm());
+        let rate = rate_of(grid.tick_us());
+        w.put(u64::from(rate.is_some()), 1);
+        match rate {
+            Some(rate_hz) => w.golomb(u64::from(rate_hz), RATE_ORDER),
+            None => number(w, grid.tick_us()),
+        }
+        let Some(first) = points.first() else {
+            return;
+        };
+        w.golomb(u64::from(first.0), 0);
+        for x in first.1 {
+            w.signed(i64::from(x), first_order(grid.step_nm()));
+        }
+        let gap = |i: usize| u64::from(points[i].0 - points[i - 1].0 - 1);
+        numbers.clear();
+        numbers.extend((1..points.len()).map(gap));
+        let (gap_order, _) = best_order(numbers);
+        w.golomb(u64::from(gap_order), GAP_ORDER);
+        let columns = columns(points, numbers);
+        let mut before = None;
+        for (rule, order) in columns {
+            w.put(rule as u64, 2);
+            match before.replace(order) {
+                None => w.golomb(u64::from(order), COLUMN_ORDER),
+                Some(before) => w.signed(i64::from(order) - i64::from(before), 0),
+            }
+        }
+        for i in 1..points.len() {
+            w.golomb(gap(i), gap_order);
+            for (d, (rule, order)) in columns.into_iter().enumerate() {
+                w.golomb(off_by(points, i, d, rule), order);
+            }
+        }
+    }
+}
+
 pub(super) fn pack<const D: usize>(grid: Grid, points: &[Point<D>]) -> Vec<u8> {
-    let mut w = BitWriter::default();
-    w.golomb(points.len() as u64, COUNT_ORDER);
-    let number = |w: &mut BitWriter, n| {
-        let (digits, tens) = mantissa(n);
-        w.golomb(u64::from(digits), MANTISSA_ORDER);
-        w.put(u64::from(tens), 4);
-    };
-    number(&mut w, grid.step_nm());
-    let rate = rate_of(grid.tick_us());
-    w.put(u64::from(rate.is_some()), 1);
-    match rate {
-        Some(rate_hz) => w.golomb(u64::from(rate_hz), RATE_ORDER),
-        None => number(&mut w, grid.tick_us()),
-    }
-    let Some(first) = points.first() else {
-        return w.finish();
-    };
-    w.golomb(u64::from(first.0), 0);
-    for x in first.1 {
-        w.signed(i64::from(x), first_order(grid.step_nm()));
-    }
-    let gaps: Vec<u64> = points
-        .windows(2)
-        .map(|p| u64::from(p[1].0 - p[0].0 - 1))
-        .collect();
-    let (gap_order, _) = best_order(&gaps);
-    w.golomb(u64::from(gap_order), GAP_ORDER);
-    let columns = columns(points);
-    let mut before = None;
-    for column in &columns {
-        w.put(column.rule as u64, 2);
-        match before.replace(column.order) {
-            None => w.golomb(u64::from(column.order), COLUMN_ORDER),
-            Some(before) => w.signed(i64::from(column.order) - i64::from(before), 0),
-        }
-    }
-    for (i, gap) in gaps.iter().enumerate() {
-        w.golomb(*gap, gap_order);
-        for column in &columns {
-            w.golomb(column.off[i], column.order);
-        }
-    }
-    w.finish()
+    let mut packer = Packer::default();
+    packer.write(grid, points);
+    packer.w.finish()
 }
 
 /// What values cost with the rules and orders that are best for some points, and a little more for what is far off:
@@ -168,9 +185,9 @@ pub(super) struct Price<const D: usize> {
 }
 
 impl<const D: usize> Price<D> {
-    pub(super) fn of(points: &[Point<D>]) -> Self {
+    pub(super) fn of(points: &[Point<D>], packer: &mut Packer) -> Self {
         Self {
-            columns: columns(points).map(|c| (c.rule, c.order)),
+            columns: columns(points, &mut packer.numbers),
         }
     }
 
@@ -178,8 +195,7 @@ impl<const D: usize> Price<D> {
     pub(super) fn around(&self, points: &[Point<D>], j: usize, d: usize) -> f64 {
         let (rule, order) = self.columns[d];
         let bits = |i: usize| {
-            let p = &points[i];
-            let off = zigzag(i64::from(p.1[d]) - expected(rule, &points[..i], p.0, d));
+            let off = off_by(points, i, d, rule);
             let unit = (1_u64 << order) as f64;
             golomb_bits(off, order) as f64 + 0.3 * libm::log2(1.0 + 2.0 * off as f64 / unit)
         };

@@ -3,8 +3,9 @@
 use nalgebra::SVector;
 use serde::{Deserialize, Serialize};
 
-use super::{Checkpoint, CheckpointError, packed};
-use crate::spline::{BSpline, End};
+use super::packed::{self, Packer};
+use super::{Checkpoint, CheckpointError};
+use crate::spline::{BSpline, End, Interpolation};
 
 /// The most checkpoints one plan holds.
 pub const MAX_POINTS: usize = 4096;
@@ -147,21 +148,73 @@ impl<const D: usize> Plan<D> {
     /// [`CheckpointError`]: too few or too many points, times that do not increase on the grid, values
     /// outside its range.
     pub fn quantise(grid: Grid, points: &[Checkpoint<D>]) -> Result<Self, CheckpointError> {
-        let rounded = points
-            .iter()
-            .enumerate()
-            .map(|(index, p)| {
-                let ticks = grid.ticks(p.t_s);
-                let steps = grid.steps(&p.x);
-                ticks
-                    .zip(steps)
-                    .ok_or(CheckpointError::OutOfRange { index })
-            })
-            .collect::<Result<_, _>>()?;
-        Self::checked(grid, rounded)
+        let mut plan = Self::blank();
+        plan.requantise(grid, points.iter().copied())?;
+        Ok(plan)
+    }
+
+    /// Nothing yet: a place for [`Plan::requantise`].
+    pub(super) fn blank() -> Self {
+        let grid = Grid {
+            step_nm: 1,
+            tick_us: 1,
+        };
+        let points = Vec::new();
+        Self { grid, points }
+    }
+
+    /// Becomes a plan of `points` rounded to `grid`, in the memory it has; after an error it is none.
+    pub(super) fn requantise(
+        &mut self,
+        grid: Grid,
+        points: impl Iterator<Item = Checkpoint<D>>,
+    ) -> Result<(), CheckpointError> {
+        self.grid = grid;
+        self.points.clear();
+        for (index, p) in points.enumerate() {
+            let point = grid.ticks(p.t_s).zip(grid.steps(&p.x));
+            self.points
+                .push(point.ok_or(CheckpointError::OutOfRange { index })?);
+        }
+        self.check()
+    }
+
+    /// Becomes `other`, in the memory it has.
+    pub(super) fn copy(&mut self, other: &Self) {
+        self.grid = other.grid;
+        self.points.clone_from(&other.points);
+    }
+
+    /// Memory for so many points.
+    pub(super) fn reserve(&mut self, count: usize) {
+        self.points.clear();
+        self.points.reserve(count);
+    }
+
+    /// Moves the coordinate `d` of the point `j` and of the next by so many steps. False, and nothing has changed, if there
+    /// is no next point that is to move, or it would leave the grid.
+    pub(super) fn shift(&mut self, j: usize, d: usize, by: [i32; 2]) -> bool {
+        let count = if by[1] == 0 { 1 } else { 2 };
+        let Some(there) = self.points.get_mut(j..j + count) else {
+            return false;
+        };
+        let in_range = |x: i32, by: i32| x.abs() <= MAX_STEPS - by.abs();
+        if !there.iter().zip(by).all(|((_, x), by)| in_range(x[d], by)) {
+            return false;
+        }
+        for ((_, x), by) in there.iter_mut().zip(by) {
+            x[d] += by;
+        }
+        true
     }
 
     fn checked(grid: Grid, points: Vec<(u32, [i32; D])>) -> Result<Self, CheckpointError> {
+        let plan = Self { grid, points };
+        plan.check().map(|()| plan)
+    }
+
+    fn check(&self) -> Result<(), CheckpointError> {
+        let points = &self.points;
         if points.len() < 2 {
             return Err(CheckpointError::TooFew {
                 count: points.len(),
@@ -173,7 +226,7 @@ impl<const D: usize> Plan<D> {
         }
         match points.windows(2).position(|w| w[1].0 <= w[0].0) {
             Some(i) => Err(CheckpointError::Unordered { index: i + 1 }),
-            None => Ok(Self { grid, points }),
+            None => Ok(()),
         }
     }
 
@@ -191,14 +244,6 @@ impl<const D: usize> Plan<D> {
         &self.points
     }
 
-    /// Other points on the same grid.
-    pub(super) fn with_points(
-        &self,
-        points: Vec<(u32, [i32; D])>,
-    ) -> Result<Self, CheckpointError> {
-        Self::checked(self.grid, points)
-    }
-
     /// The grid its points lie on.
     pub fn grid(&self) -> Grid {
         self.grid
@@ -206,7 +251,12 @@ impl<const D: usize> Plan<D> {
 
     /// How many bytes it takes on the wire, its own length among them.
     pub fn byte_len(&self) -> usize {
-        let bytes = packed::pack(self.grid, &self.points).len();
+        self.byte_len_by(&mut Packer::default())
+    }
+
+    /// The same, with the packer's memory.
+    pub(super) fn byte_len_by(&self, packer: &mut Packer) -> usize {
+        let bytes = packer.pack(self.grid, &self.points).len();
         bytes + if bytes < 251 { 1 } else { 3 }
     }
 
@@ -225,9 +275,31 @@ impl<const D: usize> Plan<D> {
     /// [`SplineError::Singular`](crate::spline::SplineError::Singular) for times so uneven (a billion to
     /// one) that `f64` cannot tell them apart.
     pub fn spline(&self) -> Result<BSpline<D>, CheckpointError> {
-        let (t, x): (Vec<f64>, Vec<_>) = self.checkpoints().map(|c| (c.t_s, c.x)).unzip();
-        Ok(BSpline::interpolate(&t, &x, End::Natural)?)
+        self.spline_by(&mut Decoder::default()).cloned()
     }
+
+    /// The same, in the decoder's memory.
+    pub(super) fn spline_by<'a>(
+        &self,
+        decoder: &'a mut Decoder<D>,
+    ) -> Result<&'a BSpline<D>, CheckpointError> {
+        let Decoder { t, x, curve } = decoder;
+        t.clear();
+        x.clear();
+        for c in self.checkpoints() {
+            t.push(c.t_s);
+            x.push(c.x);
+        }
+        Ok(curve.through(t, x, End::Natural)?)
+    }
+}
+
+/// What decoding a plan reuses.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Decoder<const D: usize> {
+    t: Vec<f64>,
+    x: Vec<SVector<f64, D>>,
+    curve: Interpolation<D>,
 }
 
 /// A plan as bytes see it.

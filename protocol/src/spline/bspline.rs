@@ -75,63 +75,9 @@ impl<const D: usize> BSpline<D> {
     /// [`SplineError`]: fewer than two points, lists of different length, anything not finite, times
     /// that do not increase.
     pub fn interpolate(t: &[f64], y: &[SVector<f64, D>], end: End) -> Result<Self, SplineError> {
-        let n = t.len();
-        if n < 2 {
-            return Err(SplineError::TooFew { count: n, least: 2 });
-        }
-        if y.len() != n {
-            return Err(SplineError::CountMismatch {
-                found: y.len(),
-                expected: n,
-            });
-        }
-        if let Some(index) = t.iter().position(|v| !v.is_finite()) {
-            return Err(SplineError::NonFinite { index });
-        }
-        check_finite(y)?;
-        if let Some(i) = t.windows(2).position(|w| w[1] <= w[0]) {
-            return Err(SplineError::Unordered { index: i + 1 });
-        }
-        let inner = match end {
-            End::NotAKnot if n == 3 => &t[1..1],
-            End::NotAKnot if n > 3 => &t[2..n - 2],
-            _ => &t[1..n - 1],
-        };
-        let knots = clamped(t[0], inner, t[n - 1]);
-        let count = inner.len() + DEGREE + 1;
-        let mut rows: Vec<Row> = vec![[0.0; 5]; count];
-        let mut control = vec![SVector::zeros(); count];
-        rows[0][2] = 1.0;
-        control[0] = y[0];
-        rows[count - 1][2] = 1.0;
-        control[count - 1] = y[n - 1];
-        let mut collocate = |row: usize, i: usize| {
-            let (first, weights) = basis(&knots, count, t[i]);
-            for (c, w) in (first..).zip(weights) {
-                if w != 0.0 {
-                    rows[row][c + 2 - row] = w;
-                }
-            }
-            control[row] = y[i];
-        };
-        match end {
-            End::NotAKnot if n > 3 => (1..n - 1).for_each(|i| collocate(i, i)),
-            End::NotAKnot if n == 3 => {
-                collocate(1, 1);
-                rows[2] = [-1.0, 3.0, -3.0, 1.0, 0.0];
-            }
-            _ => {
-                (1..n - 1).for_each(|i| collocate(i + 1, i));
-                // Equal first-derivative control points on either side: x'' = 0.
-                for row in [1, count - 2] {
-                    let before = 1.0 / (knots[row + 3] - knots[row]);
-                    let after = 1.0 / (knots[row + 4] - knots[row + 1]);
-                    rows[row] = [0.0, -before, before + after, -after, 0.0];
-                }
-            }
-        }
-        banded::solve(&mut rows, &mut control).ok_or(SplineError::Singular)?;
-        Ok(Self { knots, control })
+        let mut interpolation = Interpolation::default();
+        interpolation.through(t, y, end)?;
+        Ok(interpolation.curve)
     }
 
     /// The clamped uniform curve on `[0, 1]` with these control points (at least four): the source
@@ -195,6 +141,100 @@ impl<const D: usize> BSpline<D> {
     }
 }
 
+/// [`BSpline::interpolate`] again and again in the same memory.
+#[derive(Clone, Debug)]
+pub(crate) struct Interpolation<const D: usize> {
+    rows: Vec<Row>,
+    curve: BSpline<D>,
+}
+
+impl<const D: usize> Default for Interpolation<D> {
+    fn default() -> Self {
+        let curve = BSpline {
+            knots: Vec::new(),
+            control: Vec::new(),
+        };
+        Self {
+            rows: Vec::new(),
+            curve,
+        }
+    }
+}
+
+impl<const D: usize> Interpolation<D> {
+    /// As [`BSpline::interpolate`].
+    pub(crate) fn through(
+        &mut self,
+        t: &[f64],
+        y: &[SVector<f64, D>],
+        end: End,
+    ) -> Result<&BSpline<D>, SplineError> {
+        let n = t.len();
+        if n < 2 {
+            return Err(SplineError::TooFew { count: n, least: 2 });
+        }
+        if y.len() != n {
+            return Err(SplineError::CountMismatch {
+                found: y.len(),
+                expected: n,
+            });
+        }
+        if let Some(index) = t.iter().position(|v| !v.is_finite()) {
+            return Err(SplineError::NonFinite { index });
+        }
+        check_finite(y)?;
+        if let Some(i) = t.windows(2).position(|w| w[1] <= w[0]) {
+            return Err(SplineError::Unordered { index: i + 1 });
+        }
+        let inner = match end {
+            End::NotAKnot if n == 3 => &t[1..1],
+            End::NotAKnot if n > 3 => &t[2..n - 2],
+            _ => &t[1..n - 1],
+        };
+        let Self {
+            rows,
+            curve: BSpline { knots, control },
+        } = self;
+        clamp(knots, t[0], inner, t[n - 1]);
+        let count = inner.len() + DEGREE + 1;
+        rows.clear();
+        rows.resize(count, [0.0; 5]);
+        control.clear();
+        control.resize(count, SVector::zeros());
+        rows[0][2] = 1.0;
+        control[0] = y[0];
+        rows[count - 1][2] = 1.0;
+        control[count - 1] = y[n - 1];
+        let mut collocate = |row: usize, i: usize| {
+            let (first, weights) = basis(knots, count, t[i]);
+            for (c, w) in (first..).zip(weights) {
+                if w != 0.0 {
+                    rows[row][c + 2 - row] = w;
+                }
+            }
+            control[row] = y[i];
+        };
+        match end {
+            End::NotAKnot if n > 3 => (1..n - 1).for_each(|i| collocate(i, i)),
+            End::NotAKnot if n == 3 => {
+                collocate(1, 1);
+                rows[2] = [-1.0, 3.0, -3.0, 1.0, 0.0];
+            }
+            _ => {
+                (1..n - 1).for_each(|i| collocate(i + 1, i));
+                // Equal first-derivative control points on either side: x'' = 0.
+                for row in [1, count - 2] {
+                    let before = 1.0 / (knots[row + 3] - knots[row]);
+                    let after = 1.0 / (knots[row + 4] - knots[row + 1]);
+                    rows[row] = [0.0, -before, before + after, -after, 0.0];
+                }
+            }
+        }
+        banded::solve(rows, control).ok_or(SplineError::Singular)?;
+        Ok(&self.curve)
+    }
+}
+
 /// De Boor's recurrence for the `N` control points that are alive on span `j`.
 fn de_boor<const D: usize, const N: usize>(
     k: &[f64],
@@ -243,10 +283,15 @@ fn span_of(k: &[f64], count: usize, t: f64) -> usize {
 
 fn clamped(start: f64, inner: &[f64], end: f64) -> Vec<f64> {
     let mut knots = Vec::with_capacity(inner.len() + 2 * (DEGREE + 1));
+    clamp(&mut knots, start, inner, end);
+    knots
+}
+
+fn clamp(knots: &mut Vec<f64>, start: f64, inner: &[f64], end: f64) {
+    knots.clear();
     knots.extend([start; DEGREE + 1]);
     knots.extend_from_slice(inner);
     knots.extend([end; DEGREE + 1]);
-    knots
 }
 
 fn check_finite<const D: usize>(points: &[SVector<f64, D>]) -> Result<(), SplineError> {

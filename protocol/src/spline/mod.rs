@@ -8,6 +8,7 @@ mod banded;
 mod bspline;
 mod hermite;
 
+pub(crate) use bspline::Interpolation;
 pub use bspline::{BSpline, End};
 pub use hermite::HermiteSpan;
 

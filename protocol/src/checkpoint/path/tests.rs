@@ -309,12 +309,9 @@ proptest! {
         let (t, x): (Vec<f64>, Vec<_>) =
             samples.iter().map(|(t, x)| (on_tick(*t).secs_since(on_tick(first)), *x)).unzip();
         prop_assume!(t.len() > 1);
-        let plan = crate::checkpoint::select::bounded_with(
-            &t,
-            &x,
-            bound_m,
-            crate::checkpoint::select::Effort::Quick,
-        );
+        let mut selector = crate::checkpoint::select::Selector::new();
+        let effort = crate::checkpoint::select::Effort::Quick;
+        let plan = selector.bounded(&t, &x, bound_m, effort).cloned();
         // Jumps between samples closer than a tick of the plan.
         prop_assume!(plan.is_ok());
         let plan = plan.unwrap();

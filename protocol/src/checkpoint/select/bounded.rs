@@ -5,19 +5,7 @@ use nalgebra::SVector;
 use super::super::{CheckpointError, Grid, Plan, check_series};
 use super::cheapen::cheapen;
 use super::search::{Motion, Search};
-
-/// How long to look.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Effort {
-    /// Checkpoints on the curve, inserted until the bound holds: some passes over the samples.
-    Quick,
-    /// Then fewer equal shares of the curvature, off the curve, and those left out that are not needed: less than a
-    /// millisecond for 300 samples.
-    Brisk,
-    /// Then fewer, moved, off the curve where that helps, on coarser grids, at values that are cheap to write: tenths of
-    /// a second.
-    Thorough,
-}
+use super::{Effort, Lists, Selector};
 
 /// Sample evaluations spent on making a sufficient choice smaller, on each grid.
 const REFINING_EFFORT: usize = 1 << 22;
@@ -34,150 +22,182 @@ const COARSER: [f64; 4] = [1.0, 2.0, 3.0, 4.0];
 /// Checkpoints of the motion `y` (m) at times `t` (s from its start, not negative, increasing) whose
 /// decoded curve passes within `bound_m` of *every* sample.
 ///
-/// As [`bounded_with`] [`Effort::Thorough`].
+/// As [`Selector::bounded`] with [`Effort::Thorough`].
 ///
 /// # Errors
-/// As [`bounded_with`].
+/// As [`Selector::bounded`].
 pub fn bounded<const D: usize>(
     t: &[f64],
     y: &[SVector<f64, D>],
     bound_m: f64,
 ) -> Result<Plan<D>, CheckpointError> {
-    bounded_with(t, y, bound_m, Effort::Thorough)
+    let mut selector = Selector::new();
+    selector.bounded(t, y, bound_m, Effort::Thorough).cloned()
 }
 
-/// Checkpoints of the motion `y` (m) at times `t` (s from its start, not negative, increasing) whose
-/// decoded curve passes within `bound_m` of *every* sample.
-///
-/// Starts from equal shares of √|Laplacian| (the curvature), inserts the worst samples until the bound
-/// holds on the quantised curve, then drops points, moves others, and fits the values, as long as it
-/// holds; last, it is checked on what the plan decodes to. How it chooses is free; what [`Plan`] decodes to
-/// is not.
-///
-/// # Errors
-/// [`CheckpointError`]: an unusable bound or series, more than [`MAX_POINTS`](super::super::MAX_POINTS)
-/// needed, samples less than a microsecond apart that differ by more than the bound.
-pub fn bounded_with<const D: usize>(
-    t: &[f64],
-    y: &[SVector<f64, D>],
-    bound_m: f64,
-    effort: Effort,
-) -> Result<Plan<D>, CheckpointError> {
-    let fine = Grid::for_bound(bound_m)?;
-    check_series(t, y)?;
-    let motion = Motion::new(t, y);
-    if effort == Effort::Quick {
-        return first_that_holds(fine, |grid| quick(&motion, grid, bound_m));
-    }
-    if effort == Effort::Brisk {
-        let grid = fine.coarser(BRISK_STEP).with_ticks_of(t);
-        return first_that_holds(grid, |grid| brisk(&motion, grid, bound_m))
-            .or_else(|_| first_that_holds(fine, |grid| quick(&motion, grid, bound_m)));
-    }
-    let mut best: Option<(usize, Plan<D>)> = None;
-    let mut refusal = None;
-    for coarser in COARSER {
-        let grid = fine.coarser(coarser).with_ticks_of(t);
-        match first_that_holds(grid, |grid| thorough(&motion, grid, bound_m)) {
-            Ok(plan) => {
-                let bytes = plan.byte_len();
-                if best.as_ref().is_none_or(|b| bytes < b.0) {
-                    best = Some((bytes, plan));
-                }
+impl<const D: usize> Selector<D> {
+    /// Checkpoints of the motion `y` (m) at times `t` (s from its start, not negative, increasing) whose
+    /// decoded curve passes within `bound_m` of *every* sample.
+    ///
+    /// Starts from equal shares of √|Laplacian| (the curvature), inserts the worst samples until the bound
+    /// holds on the quantised curve, then drops points, moves others, and fits the values, as long as it
+    /// holds; last, it is checked on what the plan decodes to. How it chooses is free; what [`Plan`] decodes to
+    /// is not.
+    ///
+    /// # Errors
+    /// [`CheckpointError`]: an unusable bound or series, more than [`MAX_POINTS`](super::super::MAX_POINTS)
+    /// needed, samples less than a microsecond apart that differ by more than the bound.
+    pub fn bounded(
+        &mut self,
+        t: &[f64],
+        y: &[SVector<f64, D>],
+        bound_m: f64,
+        effort: Effort,
+    ) -> Result<&Plan<D>, CheckpointError> {
+        let fine = Grid::for_bound(bound_m)?;
+        check_series(t, y)?;
+        let motion = Motion { t, y };
+        self.begin(motion);
+        match effort {
+            Effort::Quick => self.quick(motion, fine, bound_m)?,
+            Effort::Brisk => {
+                let grid = fine.coarser(BRISK_STEP).with_ticks_of(t);
+                self.first_that_holds(grid, |s, grid| s.brisk(motion, grid, bound_m))
+                    .or_else(|_| self.quick(motion, fine, bound_m))?;
             }
-            Err(e) => refusal = refusal.or(Some(e)),
+            Effort::Thorough => return self.cheapest(motion, fine, bound_m),
+        }
+        Ok(&self.plan)
+    }
+
+    /// Thoroughly, on coarser grids too: the one in the fewest bytes.
+    fn cheapest(
+        &mut self,
+        motion: Motion<'_, D>,
+        fine: Grid,
+        bound_m: f64,
+    ) -> Result<&Plan<D>, CheckpointError> {
+        let mut least: Option<usize> = None;
+        let mut refusal = None;
+        for coarser in COARSER {
+            let grid = fine.coarser(coarser).with_ticks_of(motion.t);
+            match self.first_that_holds(grid, |s, grid| s.thorough(motion, grid, bound_m)) {
+                Ok(()) => {
+                    let bytes = self.plan.byte_len_by(&mut self.packer);
+                    if least.is_none_or(|least| bytes < least) {
+                        least = Some(bytes);
+                        self.best.copy(&self.plan);
+                    }
+                }
+                Err(e) => refusal = refusal.or(Some(e)),
+            }
+        }
+        match (least, refusal) {
+            (Some(_), _) => Ok(&self.best),
+            (None, Some(e)) => Err(e),
+            (None, None) => unreachable!("there is a grid to try"),
         }
     }
-    match (best, refusal) {
-        (Some((_, plan)), _) => Ok(plan),
-        (None, Some(e)) => Err(e),
-        (None, None) => unreachable!("there is a grid to try"),
-    }
-}
 
-/// On a grid, or with finer ticks where the samples' times do not suit it.
-fn first_that_holds<const D: usize>(
-    grid: Grid,
-    mut attempt: impl FnMut(Grid) -> Result<Plan<D>, CheckpointError>,
-) -> Result<Plan<D>, CheckpointError> {
-    match attempt(grid) {
-        Err(CheckpointError::Unreachable { .. } | CheckpointError::Unordered { .. }) => {
-            attempt(grid.with_fine_ticks())
-        }
-        other => other,
-    }
-}
-
-fn quick<const D: usize>(
-    motion: &Motion<'_, D>,
-    grid: Grid,
-    bound_m: f64,
-) -> Result<Plan<D>, CheckpointError> {
-    let mut search = Search::new(motion, grid);
-    let start = search.shares(2);
-    let kept = search.insert(start, search_bound(bound_m))?;
-    verified(search.plan(&kept)?, motion, bound_m)
-}
-
-fn brisk<const D: usize>(
-    motion: &Motion<'_, D>,
-    grid: Grid,
-    bound_m: f64,
-) -> Result<Plan<D>, CheckpointError> {
-    let mut search = Search::new(motion, grid);
-    let bound = search_bound(bound_m);
-    let start = search.shares(2);
-    let mut kept = search.insert(start, bound)?;
-    let mut plan = search.plan(&kept)?;
-    let (mut few, mut enough) = (kept.len() / 2, kept.len());
-    while few < enough {
-        let count = (few + enough) / 2;
-        let shares = search.shares(count);
-        if search.fit(&shares, bound, bound) <= bound {
-            plan = search.plan(&shares)?;
-            enough = count;
-            kept = shares;
-        } else {
-            few = count + 1;
+    /// On a grid, or with finer ticks where the samples' times do not suit it.
+    fn first_that_holds(
+        &mut self,
+        grid: Grid,
+        mut attempt: impl FnMut(&mut Self, Grid) -> Result<(), CheckpointError>,
+    ) -> Result<(), CheckpointError> {
+        match attempt(self, grid) {
+            Err(CheckpointError::Unreachable { .. } | CheckpointError::Unordered { .. }) => {
+                attempt(self, grid.with_fine_ticks())
+            }
+            other => other,
         }
     }
-    search.effort = 0;
-    leave_out(
-        &mut search,
-        &mut kept,
-        bound,
-        BRISK_EFFORT,
-        |search, kept| {
-            plan = search.plan(kept)?;
-            Ok(())
-        },
-    )?;
-    verified(plan, motion, bound_m)
-}
 
-fn thorough<const D: usize>(
-    motion: &Motion<'_, D>,
-    grid: Grid,
-    bound_m: f64,
-) -> Result<Plan<D>, CheckpointError> {
-    let mut search = Search::new(motion, grid);
-    let bound = search_bound(bound_m);
-    let start = search.shares(2);
-    let mut kept = search.insert(start, bound)?;
-    let start = search.shares(kept.len() / 2);
-    if let Ok(other) = search.insert(start, bound)
-        && other.len() < kept.len()
-    {
-        kept = other;
+    fn quick(
+        &mut self,
+        motion: Motion<'_, D>,
+        grid: Grid,
+        bound_m: f64,
+    ) -> Result<(), CheckpointError> {
+        self.first_that_holds(grid, |s, grid| {
+            let mut search = Search::new(motion, grid, &mut s.buffers);
+            let kept = &mut s.lists.kept;
+            search.shares(2, kept);
+            search.insert(kept, search_bound(bound_m))?;
+            search.plan(kept, &mut s.plan)?;
+            s.verified(motion, bound_m)
+        })
     }
-    search.on_curve(&kept);
-    let mut plan = search.plan(&kept)?;
-    refine(&mut search, &mut kept, bound, |search, kept| {
-        plan = search.plan(kept)?;
+
+    fn brisk(
+        &mut self,
+        motion: Motion<'_, D>,
+        grid: Grid,
+        bound_m: f64,
+    ) -> Result<(), CheckpointError> {
+        let mut search = Search::new(motion, grid, &mut self.buffers);
+        let (lists, plan) = (&mut self.lists, &mut self.plan);
+        let bound = search_bound(bound_m);
+        search.shares(2, &mut lists.kept);
+        search.insert(&mut lists.kept, bound)?;
+        search.plan(&lists.kept, plan)?;
+        let (mut few, mut enough) = (lists.kept.len() / 2, lists.kept.len());
+        while few < enough {
+            let count = (few + enough) / 2;
+            search.shares(count, &mut lists.other);
+            if search.fit(&lists.other, bound, bound) <= bound {
+                search.plan(&lists.other, plan)?;
+                enough = count;
+                lists.kept.clone_from(&lists.other);
+            } else {
+                few = count + 1;
+            }
+        }
+        search.effort = 0;
+        leave_out(&mut search, &mut lists.kept, bound, BRISK_EFFORT, plan)?;
+        self.verified(motion, bound_m)
+    }
+
+    fn thorough(
+        &mut self,
+        motion: Motion<'_, D>,
+        grid: Grid,
+        bound_m: f64,
+    ) -> Result<(), CheckpointError> {
+        let mut search = Search::new(motion, grid, &mut self.buffers);
+        let (lists, plan) = (&mut self.lists, &mut self.plan);
+        let bound = search_bound(bound_m);
+        search.shares(2, &mut lists.kept);
+        search.insert(&mut lists.kept, bound)?;
+        search.shares(lists.kept.len() / 2, &mut lists.other);
+        if search.insert(&mut lists.other, bound).is_ok() && lists.other.len() < lists.kept.len() {
+            lists.kept.clone_from(&lists.other);
+        }
+        search.on_curve(&lists.kept);
+        search.plan(&lists.kept, plan)?;
+        refine(&mut search, lists, bound, plan)?;
+        self.dear.copy(&self.plan);
+        let memory = (&mut self.room, &mut self.packer);
+        cheapen(&mut self.plan, motion, bound, memory);
+        self.verified(motion, bound_m).or_else(|_| {
+            self.plan.copy(&self.dear);
+            self.verified(motion, bound_m)
+        })
+    }
+
+    /// Whether what the plan decodes to passes every sample within the bound.
+    fn verified(&mut self, motion: Motion<'_, D>, bound_m: f64) -> Result<(), CheckpointError> {
+        let spline = self.plan.spline_by(&mut self.decoder)?;
+        let (start_s, end_s) = spline.span_s();
+        for (index, (&t, y)) in motion.t.iter().zip(motion.y).enumerate() {
+            // A sample on the end's tick may lie a rounding error outside.
+            let error_m = (spline.eval(t.clamp(start_s, end_s))?.x - y).norm();
+            if error_m > bound_m {
+                return Err(CheckpointError::Unreachable { index, error_m });
+            }
+        }
         Ok(())
-    })?;
-    let cheaper = cheapen(&plan, motion, bound)?;
-    verified(cheaper, motion, bound_m).or_else(|_| verified(plan, motion, bound_m))
+    }
 }
 
 /// The search computes in another order than the decoder: it aims this much inside the bound.
@@ -185,19 +205,19 @@ fn search_bound(bound_m: f64) -> f64 {
     bound_m * (1.0 - 1e-7)
 }
 
-/// Drops as many points as go without moving any.
+/// Drops as many points as go without moving any; `plan` becomes that of what is left, if any went.
 fn leave_out<const D: usize>(
     search: &mut Search<'_, D>,
     kept: &mut Vec<usize>,
     bound: f64,
     effort: usize,
-    mut accept: impl FnMut(&Search<'_, D>, &[usize]) -> Result<(), CheckpointError>,
+    plan: &mut Plan<D>,
 ) -> Result<(), CheckpointError> {
     let mut j = 1;
     while j + 1 < kept.len() && search.effort < effort {
         let dropped = kept.remove(j);
         if search.fit(kept, bound, bound) <= bound {
-            accept(search, kept)?;
+            search.plan(kept, plan)?;
         } else {
             kept.insert(j, dropped);
             j += 1;
@@ -206,17 +226,22 @@ fn leave_out<const D: usize>(
     Ok(())
 }
 
-/// Drops points while some least-squares values, or others' places, keep the bound.
+/// Drops points while some least-squares values, or others' places, keep the bound; `plan` as with [`leave_out`].
 fn refine<const D: usize>(
     search: &mut Search<'_, D>,
-    kept: &mut Vec<usize>,
+    lists: &mut Lists,
     bound: f64,
-    mut accept: impl FnMut(&Search<'_, D>, &[usize]) -> Result<(), CheckpointError>,
+    plan: &mut Plan<D>,
 ) -> Result<(), CheckpointError> {
-    leave_out(search, kept, bound, REFINING_EFFORT, &mut accept)?;
+    let Lists {
+        kept,
+        other: before,
+        costs,
+        order,
+        ..
+    } = lists;
+    leave_out(search, kept, bound, REFINING_EFFORT, plan)?;
     // Then the one whose loss costs least, the others moved to make up for it.
-    let (mut costs, mut order): (Vec<(f64, usize)>, Vec<usize>) = (Vec::new(), Vec::new());
-    let mut before = Vec::new();
     while kept.len() > 2 && search.effort < REFINING_EFFORT {
         costs.clear();
         for j in 1..kept.len() - 1 {
@@ -227,7 +252,7 @@ fn refine<const D: usize>(
             costs.push((search.fit(kept, bound, 4.0 * bound), j));
             kept.insert(j, left_out);
         }
-        costs.sort_by(|a, b| a.0.total_cmp(&b.0));
+        costs.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         let mut dropped = false;
         for &(error_m, j) in costs.iter().take(6) {
             if !error_m.is_finite() {
@@ -235,12 +260,12 @@ fn refine<const D: usize>(
             }
             before.clone_from(kept);
             kept.remove(j);
-            if relocate(search, kept, &mut order, error_m, j, bound) {
-                accept(search, kept)?;
+            if relocate(search, kept, order, error_m, j, bound) {
+                search.plan(kept, plan)?;
                 dropped = true;
                 break;
             }
-            kept.clone_from(&before);
+            kept.clone_from(before);
         }
         if !dropped {
             break;
@@ -264,7 +289,7 @@ fn relocate<const D: usize>(
     }
     order.clear();
     order.extend(1..kept.len() - 1);
-    order.sort_by_key(|&j| (2 * j + 1).abs_diff(2 * gap));
+    order.sort_unstable_by_key(|&j| ((2 * j + 1).abs_diff(2 * gap), j));
     let mut moved = true;
     while moved && search.effort < REFINING_EFFORT {
         moved = false;
@@ -298,24 +323,6 @@ fn relocate<const D: usize>(
         }
     }
     false
-}
-
-/// `plan`, if what it decodes to passes every sample within the bound.
-fn verified<const D: usize>(
-    plan: Plan<D>,
-    motion: &Motion<'_, D>,
-    bound_m: f64,
-) -> Result<Plan<D>, CheckpointError> {
-    let spline = plan.spline()?;
-    let (start_s, end_s) = spline.span_s();
-    for (index, (&t, y)) in motion.t.iter().zip(motion.y).enumerate() {
-        // A sample on the end's tick may lie a rounding error outside.
-        let error_m = (spline.eval(t.clamp(start_s, end_s))?.x - y).norm();
-        if error_m > bound_m {
-            return Err(CheckpointError::Unreachable { index, error_m });
-        }
-    }
-    Ok(plan)
 }
 
 #[cfg(test)]

@@ -2,8 +2,8 @@
 
 use nalgebra::SVector;
 
-use super::super::packed::Price;
-use super::super::{CheckpointError, Plan};
+use super::super::Plan;
+use super::super::packed::{Packer, Price};
 use super::fit::Curve;
 use super::search::Motion;
 
@@ -30,37 +30,34 @@ const MOVES: [[i32; 2]; 8] = [
 
 /// Moves single values, and neighbours together, as long as that takes fewer bits and the curve stays within `bound` of
 /// the samples. A motion that is too long for it, or beyond the bound already, is left as it is.
-///
-/// # Errors
-/// None that a plan shows whose points are only moved.
 pub(super) fn cheapen<const D: usize>(
-    plan: &Plan<D>,
-    motion: &Motion<'_, D>,
+    plan: &mut Plan<D>,
+    motion: Motion<'_, D>,
     bound: f64,
-) -> Result<Plan<D>, CheckpointError> {
-    let mut points = plan.points().to_vec();
-    if points.len() * motion.t.len() > MOST {
-        return Ok(plan.clone());
+    (room, packer): (&mut Room<D>, &mut Packer),
+) {
+    if plan.len() * motion.t.len() > MOST {
+        return;
     }
-    let mut room = Room::of(plan, motion, bound);
+    room.fill(plan, motion, bound);
     if !room.spent.is_finite() {
-        return Ok(plan.clone());
+        return;
     }
     for _ in 0..SWEEPS {
-        let price = Price::of(&points);
+        let price = Price::of(plan.points(), packer);
         let mut moved = false;
-        for j in 0..points.len() {
+        for j in 0..plan.len() {
             for d in 0..D {
                 for by in MOVES {
-                    let before = price.around(&points, j, d);
-                    if !shift(&mut points, j, d, by) {
+                    let before = price.around(plan.points(), j, d);
+                    if !plan.shift(j, d, by) {
                         continue;
                     }
-                    let bits = price.around(&points, j, d) - before;
+                    let bits = price.around(plan.points(), j, d) - before;
                     if bits <= 0.0 && room.take(j, d, by, -bits / ROOM_BITS) {
                         moved = true;
                     } else {
-                        shift(&mut points, j, d, by.map(|n| -n));
+                        plan.shift(j, d, by.map(|n| -n));
                     }
                 }
             }
@@ -69,58 +66,59 @@ pub(super) fn cheapen<const D: usize>(
             break;
         }
     }
-    plan.with_points(points)
-}
-
-/// False, and nothing has changed, if there is no next point that is to move, or it would leave the grid.
-fn shift<const D: usize>(points: &mut [(u32, [i32; D])], j: usize, d: usize, by: [i32; 2]) -> bool {
-    let count = if by[1] == 0 { 1 } else { 2 };
-    let Some(there) = points.get_mut(j..j + count) else {
-        return false;
-    };
-    let in_range = |x: i32, by: i32| x.abs() <= super::super::plan::MAX_STEPS - by.abs();
-    if !there.iter().zip(by).all(|((_, x), by)| in_range(x[d], by)) {
-        return false;
-    }
-    for ((_, x), by) in there.iter_mut().zip(by) {
-        x[d] += by;
-    }
-    true
 }
 
 /// How near the curve is to the bound: the sum over the samples of (error/bound) to the sixteenth, infinite beyond it.
 ///
 /// The curve is linear in its values, so that a step at one point adds that point's cardinal spline to the errors.
-struct Room<const D: usize> {
+#[derive(Clone, Debug, Default)]
+pub(super) struct Room<const D: usize> {
     step: f64,
     bound2: f64,
-    /// For each point, what a value of one there is at the samples.
-    cardinals: Vec<Vec<f64>>,
+    knots: Vec<f64>,
+    curve: Curve<1>,
+    /// For each point, what a value of one there is at the samples: one after the other.
+    cardinals: Vec<f64>,
     errors: Vec<SVector<f64, D>>,
     spent: f64,
 }
 
 impl<const D: usize> Room<D> {
-    fn of(plan: &Plan<D>, motion: &Motion<'_, D>, bound: f64) -> Self {
-        let knots: Vec<f64> = plan.checkpoints().map(|c| c.t_s).collect();
-        let cardinals: Vec<_> = (0..knots.len())
-            .map(|j| cardinal(&knots, j, motion.t))
-            .collect();
-        let mut errors: Vec<SVector<f64, D>> = motion.y.iter().map(|y| -y).collect();
-        for (c, cardinal) in plan.checkpoints().zip(&cardinals) {
-            for (e, share) in errors.iter_mut().zip(cardinal) {
+    fn fill(&mut self, plan: &Plan<D>, motion: Motion<'_, D>, bound: f64) {
+        self.step = plan.grid().step_m();
+        self.bound2 = bound * bound;
+        self.knots.clear();
+        self.knots.extend(plan.checkpoints().map(|c| c.t_s));
+        self.errors.clear();
+        self.errors.extend(motion.y.iter().map(|y| -y));
+        self.cardinals.clear();
+        for (j, c) in plan.checkpoints().enumerate() {
+            let from = self.cardinals.len();
+            self.cardinal(j, motion.t);
+            for (e, share) in self.errors.iter_mut().zip(&self.cardinals[from..]) {
                 *e += c.x * *share;
             }
         }
-        let mut room = Self {
-            step: plan.grid().step_m(),
-            bound2: bound * bound,
+        self.spent = self.errors.iter().map(|e| self.of_error(e)).sum();
+    }
+
+    /// Adds the natural spline through 1 at knot `j` and 0 at all others, at `t`.
+    fn cardinal(&mut self, j: usize, t: &[f64]) {
+        let Self {
+            curve,
             cardinals,
-            errors,
-            spent: 0.0,
-        };
-        room.spent = room.errors.iter().map(|e| room.of_error(e)).sum();
-        room
+            knots,
+            ..
+        } = self;
+        curve.t.clone_from(knots);
+        curve.x.clear();
+        curve.x.resize(knots.len(), SVector::zeros());
+        curve.x[j][0] = 1.0;
+        curve.solve();
+        curve.visit(t, |_, x| {
+            cardinals.push(x[0]);
+            true
+        });
     }
 
     fn of_error(&self, e: &SVector<f64, D>) -> f64 {
@@ -136,12 +134,11 @@ impl<const D: usize> Room<D> {
     /// Takes the move if it spends less than `more` than now.
     fn take(&mut self, j: usize, d: usize, by: [i32; 2], more: f64) -> bool {
         let [a, b] = by.map(|n| f64::from(n) * self.step);
-        let next = (j + 1).min(self.cardinals.len() - 1);
-        let ways = || self.cardinals[j].iter().zip(&self.cardinals[next]);
+        let size = (self.errors.len(), self.knots.len());
         // Less by more than rounding, or it would go to and fro.
         let most = self.spent + more - 1e-9;
         let mut sum = 0.0;
-        for (e, (here, there)) in self.errors.iter().zip(ways()) {
+        for (e, (here, there)) in self.errors.iter().zip(ways(&self.cardinals, size, j)) {
             let mut e = *e;
             e[d] += a * here + b * there;
             sum += self.of_error(&e);
@@ -150,35 +147,36 @@ impl<const D: usize> Room<D> {
             }
         }
         self.spent = sum;
-        let ways = self.cardinals[j].iter().zip(&self.cardinals[next]);
-        for (e, (here, there)) in self.errors.iter_mut().zip(ways) {
+        for (e, (here, there)) in self.errors.iter_mut().zip(ways(&self.cardinals, size, j)) {
             e[d] += a * here + b * there;
         }
         true
     }
 }
 
-/// The natural spline through 1 at knot `j` and 0 at all others, at `t`.
-fn cardinal(knots: &[f64], j: usize, t: &[f64]) -> Vec<f64> {
-    let mut curve = Curve::<1>::default();
-    curve.t.extend_from_slice(knots);
-    curve.x.resize(knots.len(), SVector::zeros());
-    curve.x[j][0] = 1.0;
-    curve.solve();
-    let mut values = Vec::with_capacity(t.len());
-    curve.visit(t, |_, x| {
-        values.push(x[0]);
-        true
-    });
-    values
+/// The cardinal splines of the points `j` and `j + 1` (of the last one, twice the same), of so many samples and points.
+fn ways(
+    cardinals: &[f64],
+    (samples, points): (usize, usize),
+    j: usize,
+) -> impl Iterator<Item = (&f64, &f64)> {
+    let of = |j: usize| &cardinals[j * samples..(j + 1) * samples];
+    of(j).iter().zip(of((j + 1).min(points - 1)))
 }
 
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector3;
 
-    use super::super::bounded::{Effort, bounded_with};
+    use super::super::{Effort, Selector};
     use super::*;
+
+    fn cheaper<const D: usize>(plan: &Plan<D>, motion: Motion<'_, D>, bound: f64) -> Plan<D> {
+        let mut plan = plan.clone();
+        let (mut room, mut packer) = (Room::default(), Packer::default());
+        cheapen(&mut plan, motion, bound, (&mut room, &mut packer));
+        plan
+    }
 
     #[test]
     fn it_takes_fewer_bytes_and_keeps_the_bound() {
@@ -193,8 +191,10 @@ mod tests {
                 x * 0.4 + Vector3::new(noise(i), noise(3 * i), noise(5 * i))
             };
             let y: Vec<_> = t.iter().enumerate().map(at).collect();
-            let plan = bounded_with(&t, &y, bound_m, Effort::Brisk).unwrap();
-            let cheaper = cheapen(&plan, &Motion::new(&t, &y), bound_m * (1.0 - 1e-7)).unwrap();
+            let mut selector = Selector::new();
+            let plan = selector.bounded(&t, &y, bound_m, Effort::Brisk).unwrap();
+            let motion = Motion { t: &t, y: &y };
+            let cheaper = cheaper(plan, motion, bound_m * (1.0 - 1e-7));
             let curve = cheaper.spline().unwrap();
             let (start_s, end_s) = curve.span_s();
             for (t, y) in t.iter().zip(&y) {
@@ -210,8 +210,9 @@ mod tests {
     #[test]
     fn what_is_beyond_the_bound_is_left_as_it_is() {
         let (t, y) = ([0.0, 0.5, 1.0], [0.0, 1.01, 0.0].map(Vector3::repeat));
-        let plan = bounded_with(&t, &y, 0.1, Effort::Quick).unwrap();
-        let motion = Motion::new(&t, &y);
-        assert_eq!(cheapen(&plan, &motion, 1e-6).unwrap(), plan);
+        let mut selector = Selector::new();
+        let plan = selector.bounded(&t, &y, 0.1, Effort::Quick).unwrap();
+        let motion = Motion { t: &t, y: &y };
+        assert_eq!(cheaper(plan, motion, 1e-6), *plan);
     }
 }

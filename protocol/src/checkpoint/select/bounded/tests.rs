@@ -84,7 +84,11 @@ fn a_hasty_choice_holds_the_bound_too() {
     let y = hand["y"].as_array().unwrap().iter();
     let y: Vec<_> = y.map(|p| Vector3::from_iterator(list(p))).collect();
     let t = list(&hand["t"]);
-    let hasty = bounded_with(&t, &y, 0.002, Effort::Quick).unwrap();
+    let mut selector = Selector::new();
+    let hasty = selector
+        .bounded(&t, &y, 0.002, Effort::Quick)
+        .unwrap()
+        .clone();
     let thorough = bounded(&t, &y, 0.002).unwrap();
     assert!(largest_error(&hasty, &t, &y) <= 0.002);
     assert!(largest_error(&thorough, &t, &y) <= 0.002);
@@ -126,6 +130,46 @@ fn bad_input_is_named() {
         bounded(&[0.0, 1e-7, 1.0], &[y[0], y[1], y[1]], 1e-3),
         Err(CheckpointError::Unreachable { index: 1, .. })
     ));
+}
+
+/// One selector for all, in turn: what it has chosen before changes nothing, and a second choice allocates nothing.
+#[test]
+fn once_warm_it_allocates_nothing() {
+    let motion = |n: usize, pace: f64| {
+        let t: Vec<f64> = (0..n).map(|i| i as f64 / 30.0).collect();
+        let at = |t: &f64| {
+            let (s, c) = (libm::sin(pace * t), libm::cos(1.7 * pace * t));
+            Vector3::new(s, 0.6 * c, s * c) * 0.4
+        };
+        (t.clone(), t.iter().map(at).collect::<Vec<_>>())
+    };
+    let motions = [motion(200, 3.0), motion(150, 2.0)];
+    let mut selector = Selector::new();
+    for effort in [Effort::Quick, Effort::Brisk, Effort::Thorough] {
+        let cold = motions.each_ref().map(|(t, y)| {
+            let plan = Selector::new().bounded(t, y, 0.004, effort).cloned();
+            plan.unwrap()
+        });
+        let few = motions.each_ref().map(|(t, y)| {
+            let plan = Selector::new().counted(t, y, 20, effort).cloned();
+            plan.unwrap()
+        });
+        for warm in [false, true] {
+            let touched = allocation_counter::measure(|| {
+                for (i, (t, y)) in motions.iter().enumerate() {
+                    let plan = selector.bounded(t, y, 0.004, effort).unwrap();
+                    assert_eq!(*plan, cold[i]);
+                    let plan = selector.counted(t, y, 20, effort).unwrap();
+                    assert_eq!(*plan, few[i]);
+                }
+            });
+            println!(
+                "{effort:?}, warm: {warm}: {} allocations",
+                touched.count_total
+            );
+            assert!(!warm || touched.count_total == 0, "{effort:?}: {touched:?}");
+        }
+    }
 }
 
 proptest! {

@@ -21,7 +21,8 @@ fn curve(name: &str) -> (Vec<f64>, Vec<Vector1<f64>>) {
 
 /// 1 − R² of the worst dimension, decoded and quantised.
 fn lost<const D: usize>(t: &[f64], y: &[SVector<f64, D>], count: usize, effort: Effort) -> f64 {
-    let plan = counted_with(t, y, count, effort).unwrap();
+    let mut selector = Selector::new();
+    let plan = selector.counted(t, y, count, effort).unwrap();
     assert!(plan.len() <= count);
     let spline = plan.spline().unwrap();
     let (start_s, end_s) = spline.span_s();
