@@ -287,7 +287,7 @@ pub enum Refusal {
     NotYours,
 }
 
-/// Operator → robot, datagrams. A [`Motion`] is bits of its own; of the others the first byte is the index, from 1 to this.
+/// A [`Motion`] is bits of its own; every other datagram of the operator begins with its index, from 1 to this.
 const LAST_OPERATOR_DATAGRAM: u8 = 4;
 
 /// Operator → robot, datagrams.
