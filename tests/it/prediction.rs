@@ -323,8 +323,9 @@ fn must_reach(set: &str, scores: &Scores, mixture: [f64; 3], fused: [f64; 3]) ->
             ratio < 1.05 * simple,
             "{set}, knot {knot}: {ratio:.3} against {simple:.3}"
         );
-        let held = scores.covered(knot);
-        println!("{set}, knot {knot}: {held:.3} within the region of 0.9");
+        let regions = scores.held(knot);
+        println!("{set}, knot {knot}: {regions:.3?} within the regions of .5, .9, .95");
+        let [_, held, _] = regions;
         assert!(
             (0.82..0.985).contains(&held),
             "{set}, knot {knot}: {held:.3} of 0.9"
