@@ -147,7 +147,7 @@ fn a_gamepad_is_taken_where_it_is_built_in_and_else_the_refusal_says_how_to_buil
         if cfg!(feature = "gamepad") {
             assert!(!told.contains("--features"), "{told}");
         } else {
-            assert_eq!((code, told.lines().count()), (Some(1), 1), "{told}");
+            assert_eq!((code, told.lines().count()), (Some(2), 1), "{told}");
             let how = "cargo build --release --features gamepad";
             assert!(told.contains(how), "{told}");
         }
