@@ -261,9 +261,9 @@ fn a_link_that_starves_is_spoken_to_less_and_recovers() {
 #[test]
 fn a_link_that_cannot_carry_the_least_of_it_stops_the_arm() {
     let samples = long(4);
-    let link = |t_s: f64| thin(if t_s < 5.0 { 1000.0 } else { 8.0 });
+    let link = |t_s: f64| thin(if t_s < 5.0 { 1000.0 } else { 6.0 });
     let run = run(&samples, &link, SessionConfig::default(), 15);
-    run.say("8 kbit/s from 5 s on");
+    run.say("6 kbit/s from 5 s on");
     assert!(!run.completed, "if it does, the documents say too little");
     assert!(
         run.oldest_s(0.0, run.seconds) < 1.2,
