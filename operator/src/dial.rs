@@ -19,8 +19,9 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until, timeout};
 
-/// Attempts begin this far apart …
-pub const REDIAL: Duration = Duration::from_millis(250);
+/// Attempts begin this far apart, so that with [`HOLD`] none is greeted later than two round trips and 250 ms after the link's
+/// return …
+pub const REDIAL: Duration = Duration::from_millis(230);
 
 /// … and the first ones, of which nobody knows what the link carries, this.
 const FIRST_REDIAL: Duration = Duration::from_millis(500);
@@ -50,7 +51,7 @@ const HOLD: Duration = Duration::from_millis(20);
 /// farther apart than three times the mean that it estimates …
 const JITTERS: u32 = 4;
 
-/// … but no longer than this.
+/// … but no longer than a round trip, for a short one's jitter is the ends' own, and than this.
 const LONGEST_HOLD: Duration = Duration::from_millis(100);
 
 /// No answer for so long after the greeting, or after something else: it may have been thrown away all the same. QUIC
@@ -159,7 +160,8 @@ impl Pace {
     /// How long a greeting waits for the handshake's last packet.
     fn hold(&self, rtt: Duration) -> Duration {
         let usual = HOLD.min(rtt / 2);
-        usual.max(self.jitter * JITTERS).min(LONGEST_HOLD)
+        let longest = rtt.min(LONGEST_HOLD);
+        usual.max(self.jitter * JITTERS).min(longest)
     }
 
     fn next_patient(&mut self) -> Duration {
@@ -372,6 +374,7 @@ mod tests {
         for (jitter, rtt, hold) in [
             (0, 100, 20),
             (0, 2, 1),
+            (3, 8, 8),
             (3, 100, 20),
             (10, 100, 40),
             (90, 100, 100),
@@ -393,7 +396,7 @@ mod tests {
     #[test]
     fn on_a_thin_link_attempts_are_farther_apart() {
         let ms = Duration::from_millis;
-        for (answered, apart) in [(180, 250), (300, 600), (3_000, 2_000)] {
+        for (answered, apart) in [(170, 230), (300, 600), (3_000, 2_000)] {
             let seen = Seen {
                 rtt: ms(100),
                 answered: ms(answered),
