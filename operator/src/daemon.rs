@@ -9,6 +9,7 @@ mod teach;
 use std::fmt;
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -26,6 +27,7 @@ use telemime_protocol::wire::DecodeError;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{sleep_until, timeout};
 
+use crate::console::Act;
 use crate::dial::{Link, Seen};
 use crate::lessons::Lessons;
 use crate::recognise::Recogniser;
@@ -154,7 +156,7 @@ impl Daemon {
                 link = self.dial(&mut endpoint, seen, &mut *task, &mut console, &mut stop) => link?,
             };
             let Some(link) = link else { break };
-            let mut last = link.seen();
+            let mut last = link.seen(seen);
             summary.sessions += 1;
             self.begun();
             let _ = notices.send(Notice::Connected {
@@ -229,7 +231,7 @@ impl Daemon {
         (session, seen): (&mut Session, &mut Seen),
         mut link: Link,
         task: &mut Task,
-        console: Console<'_>,
+        mut console: Console<'_>,
         marks: &mut Marks,
         lessons: &mut Lessons,
     ) -> End {
@@ -288,7 +290,9 @@ impl Daemon {
             }
             // Whoever says stop is not left before the robot says it has.
             if advice == Advice::Finished && !session.stop_is_unconfirmed() {
-                return self.leave(session, link, marks, (&console, GOODBYE)).await;
+                return self
+                    .leave((session, task), link, marks, (&mut console, GOODBYE))
+                    .await;
             }
             if (task.progress() - marks.progress).abs() >= 0.01 {
                 marks.progress = task.progress();
@@ -305,11 +309,17 @@ impl Daemon {
             tokio::select! {
                 biased;
                 () = told(console.quit) => {
-                    let _ = self.leave(session, link, marks, (&console, GOODBYE)).await;
+                    // Both may have been said at once.
+                    while let Ok(word) = console.words.try_recv() {
+                        if word == Word::Stop {
+                            session.stop(self.now());
+                        }
+                    }
+                    let _ = self.leave((session, task), link, marks, (&mut console, GOODBYE)).await;
                     return End::Quit;
                 }
                 standing = self.withdrawn(key) => {
-                    let _ = self.leave(session, link, marks, (&console, SHORT_GOODBYE)).await;
+                    let _ = self.leave((session, task), link, marks, (&mut console, SHORT_GOODBYE)).await;
                     return End::Lost(match standing {
                         Standing::Revoked => "the robot's key was revoked".into(),
                         Standing::Trusted | Standing::Unknown => "the robot's key is not trusted any more".into(),
@@ -400,26 +410,62 @@ impl Daemon {
         Ok(())
     }
 
-    /// Releases, says goodbye, and waits until the robot has it, but no longer than `within`.
+    /// Releases, says goodbye, and waits until the robot has it, but no longer than `within`. A stop is heard meanwhile, too:
+    /// what is said last on the stream is the goodbye, so it goes by datagram.
     async fn leave(
         &self,
-        session: &mut Session,
+        (session, task): (&mut Session, &mut Task),
         link: Link,
         marks: &mut Marks,
-        (console, within): (&Console<'_>, Duration),
+        (console, within): (&mut Console<'_>, Duration),
     ) -> End {
         session.goodbye();
         let said = self.flush(session, &link, marks);
         let Link {
-            connection, writer, ..
+            connection,
+            writer,
+            mut frames,
+            ..
         } = link;
-        if said.is_err() || !writer.finish(within).await {
+        let mut finish = pin!(writer.finish(within));
+        let mut hears = true;
+        let held = loop {
+            while let Some(output) = session.poll_output() {
+                if let Output::Datagram { bytes, .. } = output {
+                    let _ = connection.send_datagram(bytes.into());
+                }
+            }
+            let due = session.poll_timeout().map(|(at, _)| at);
+            tokio::select! {
+                biased;
+                held = &mut finish => break held,
+                Some(word) = console.words.recv() => if word == Word::Stop {
+                    session.stop(self.now());
+                },
+                heard = task.hear() => {
+                    if let Some(Act::Stop) = task.handle(self.now(), heard, None) {
+                        session.stop(self.now());
+                    }
+                }
+                frame = frames.recv(), if hears => match frame {
+                    Some(Ok(frame)) => hears = session.handle_control(self.now(), &frame).is_ok(),
+                    _ => hears = false,
+                },
+                () = sleep_until(self.instant(due.unwrap_or_else(|| self.now()))), if due.is_some() => {
+                    session.handle_timeout(self.now());
+                }
+            }
+        };
+        if said.is_err() || !held {
             console
                 .note("the robot has not confirmed the goodbye: it may lack the end of the path");
         }
         // Only now has QUIC sent what it was given; after the release that is no motion any more.
         marks.released = Some(self.meter.counts());
         connection.close(VarInt::from_u32(0), b"goodbye");
+        if session.stop_is_unconfirmed() {
+            return End::Lost("a stop was given while it said goodbye".into());
+        }
         End::Finished
     }
 }

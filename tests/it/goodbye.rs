@@ -2,8 +2,10 @@
 
 use nalgebra::Vector3;
 use telemime::ground::{Operator, Pair, run_virtual};
+use telemime_endpoint::cli::Word;
 use telemime_operator::daemon::Notice;
 use telemime_operator::session::{Event, SessionConfig};
+use telemime_operator::task::Outcome;
 use telemime_protocol::spline::HermiteSpan;
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::RobotState;
@@ -186,4 +188,54 @@ fn whoever_could_not_leave_it_says_so() {
 #[test]
 fn an_arm_that_stops_by_itself_gets_the_whole_path_too() {
     run(&delayed(0.1), 5, End::Stops(0.8)).is_whole();
+}
+
+/// A hand is followed; its operator quits, is not heard for so long, s, and meanwhile is told to stop. What came of it, and
+/// whether the arm was stopped for good.
+fn stopped_at_goodbye(unheard_s: f64) -> (Outcome, bool) {
+    let link = delayed(0.1);
+    run_virtual(async {
+        let mut pair = Pair::start(&rig()).unwrap();
+        let config = SessionConfig::default();
+        let task = replay(unseen());
+        let operator = pair.operator(task, None, config, &link, 5).unwrap();
+        let follows = |r: &Report| r.state == RobotState::Engaged;
+        assert!(pair.wait_for(20.0, follows).await);
+        pair.run_for(1.0).await;
+        if unheard_s > 0.0 {
+            silence(&pair, &operator, &link, 5);
+            operator.quit();
+            pair.run_for(0.5 * unheard_s).await;
+            operator.say(Word::Stop);
+            pair.run_for(0.5 * unheard_s).await;
+            let robot = pair.robot_addr();
+            pair.network.link(operator.addr, robot, link.clone(), 5);
+        } else {
+            operator.say(Word::Stop);
+            operator.quit();
+        }
+        let (summary, ..) = finish(operator).await;
+        pair.run_for(0.5).await;
+        let last = pair.robot.reports().last().map(|r| r.state);
+        (summary.unwrap().outcome, last == Some(RobotState::Stopped))
+    })
+    .unwrap()
+}
+
+#[test]
+fn a_stop_is_heard_while_an_operator_leaves() {
+    for unheard_s in [0.0, 0.4, 0.7] {
+        let (outcome, stopped) = stopped_at_goodbye(unheard_s);
+        assert!(stopped, "after {unheard_s} s: {outcome:?}");
+    }
+}
+
+/// Nothing arrives any more: who said stop is told that nobody confirmed it.
+#[test]
+fn a_stop_that_nobody_heard_is_said_to_be_none() {
+    let (outcome, stopped) = stopped_at_goodbye(1.6);
+    let Outcome::Interrupted(why) = outcome else {
+        panic!("{outcome:?}");
+    };
+    assert!(!stopped && why.contains("never confirmed"), "{why}");
 }

@@ -99,6 +99,8 @@ impl Session {
     pub fn stop(&mut self, now: Stamp) {
         // Before a model that has waited for the end of what was driven: it may take seconds.
         self.control(&OperatorControl::EmergencyStop);
+        // What was granted and is not known of yet has a path, too.
+        self.complete_path();
         self.end_activity();
         self.next_stop = Some(now);
     }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use quinn::{Connection, RecvStream, SendStream};
+use quinn::{Connection, RecvStream, SendStream, VarInt};
 use telemime_protocol::wire::DecodeError;
 use telemime_protocol::wire::frame::{self, Deframer, Frame};
 use telemime_protocol::wire::hello::{self, Answer, Hello, HelloError};
@@ -207,10 +207,13 @@ async fn write(
         Ok(stopped) => stopped.is_none(),
         Err(_) => matches!(
             connection.close_reason(),
-            Some(quinn::ConnectionError::ApplicationClosed(_))
+            Some(quinn::ConnectionError::ApplicationClosed(close)) if close.error_code == GOODBYE
         ),
     }
 }
+
+/// Application close code of a peer that has no more to hear (docs/protocol.md §1).
+const GOODBYE: VarInt = VarInt::from_u32(0);
 
 /// A message longer than this is a model or a plan.
 const LONG: usize = 4 * 1024;
