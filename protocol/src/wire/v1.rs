@@ -55,7 +55,8 @@ pub type ModelId = [u8; 16];
 
 /// The part of a [`ModelId`] that every motion carries.
 pub fn model_tag(id: &ModelId) -> u16 {
-    u16::from_le_bytes([id[0], id[1]])
+    // 0 is that of no skill.
+    u16::from_le_bytes([id[0], id[1]]).max(1)
 }
 
 /// Operator → robot, on the control stream.

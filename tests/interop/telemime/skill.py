@@ -163,9 +163,9 @@ def write(skill):
 
 
 def identity(data):
-    """(id, tag): the head of the SHA-256, and its first two bytes as `Motion` carries them."""
+    """(id, tag): the head of the SHA-256, and its first two bytes as `Motion` carries them, of which 0 is 1."""
     head = hashlib.sha256(data).digest()[:16]
-    return head, int.from_bytes(head[:2], "little")
+    return head, max(1, int.from_bytes(head[:2], "little"))
 
 
 def read_file(data):
