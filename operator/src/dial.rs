@@ -75,11 +75,11 @@ pub(crate) struct Link {
 
 impl Link {
     /// What is to be known of the link, once it is lost.
-    pub(crate) fn seen(&self) -> Seen {
+    pub(crate) fn seen(&self, before: Option<Seen>) -> Seen {
         Seen {
             rtt: quic::least_rtt(&self.connection),
             answered: self.answered,
-            jitter: Duration::ZERO,
+            jitter: before.map_or(Duration::ZERO, |seen| seen.jitter),
         }
     }
 }
@@ -90,11 +90,13 @@ impl Seen {
         self.shorten(quic::least_rtt(connection));
     }
 
-    /// What has become of the datagrams each way. A hand out of sight ages, and a clock that is set moves: only what both
+    /// What has become of the datagrams each way, once the robot has said. A hand out of sight ages, and a clock that is set moves: only what both
     /// directions show is the link's.
     pub(crate) fn jittered(&mut self, up: Option<&Received>, down: &Received) {
-        let least_s = up.map_or(0.0, |up| up.jitter_s.min(down.jitter_s));
-        self.jitter = Duration::try_from_secs_f64(least_s).unwrap_or_default();
+        if let Some(up) = up {
+            let least_s = up.jitter_s.min(down.jitter_s);
+            self.jitter = Duration::try_from_secs_f64(least_s).unwrap_or_default();
+        }
     }
 
     /// A path that has become shorter has no longer packets for it.

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use telemime_operator::session::{FutureBound, MAX_LEASE_S, MAX_SILENCE_S};
+use telemime_operator::session::{FutureBound, MAX_LEASE_S, MAX_SILENCE_S, SessionConfig};
 use telemime_sim::link::{LinkConfig, parse_duration_s};
 
 use super::method::Method;
@@ -189,9 +189,14 @@ impl Settings {
             "5ms to 250ms, as an operator takes",
         )?;
         let lease_s = seconds("lease")?;
-        if !(lease_s > silence_s && lease_s <= MAX_LEASE_S) {
+        let travels = SessionConfig {
+            lease_s,
+            ..SessionConfig::default()
+        };
+        let travels_s = f64::from(travels.lease_ms()) * 1e-3;
+        if !(travels_s > silence_s && lease_s <= MAX_LEASE_S) {
             return Err(
-                "a lease is longer than the silence, and at most 1s: a robot grants no more".into(),
+                "a lease, in whole steps of 10ms, is longer than the silence, and at most 1s: a robot grants no more".into(),
             );
         }
         Ok(Self {
@@ -318,7 +323,7 @@ mod tests {
     #[test]
     fn defaults_are_what_the_daemons_are_set_to() {
         let settings = Settings::read(&texts(&[]), Path::new(".")).unwrap();
-        let session = telemime_operator::session::SessionConfig::default();
+        let session = SessionConfig::default();
         assert_eq!(settings.future, session.future_bound);
         assert_eq!(settings.path_m, session.path_bound_m);
         assert_eq!(settings.silence_s, session.max_silence_s);

@@ -309,8 +309,9 @@ impl Args {
         };
         within("--max-silence", config.max_silence_s, 0.005, MAX_SILENCE_S)
             .context("the robot coasts after 0.26 s without news")?;
-        within("--lease", config.lease_s, config.max_silence_s, MAX_LEASE_S)
-            .context("the robot grants 1 s at most, and a lease must outlast the silence")?;
+        let lease_s = f64::from(config.lease_ms()) * 1e-3;
+        within("--lease", lease_s, config.max_silence_s, MAX_LEASE_S)
+            .context("the robot grants 1 s at most, and a lease, which travels in steps of 10 ms, must outlast the silence")?;
         within(
             "--min-interval",
             config.min_interval_s,
@@ -375,6 +376,25 @@ mod tests {
             })
             .contains("--lease")
         );
+        // It would travel as no more than the silence.
+        assert!(
+            refused(Args {
+                max_silence: Some(0.2),
+                lease: Some(0.2099),
+                ..Args::default()
+            })
+            .contains("steps of 10 ms")
+        );
+        for lease in [1e3, f64::NAN, f64::INFINITY] {
+            let lease = Some(lease);
+            assert!(
+                refused(Args {
+                    lease,
+                    ..Args::default()
+                })
+                .contains("--lease")
+            );
+        }
         // What the robot would cut down in silence.
         assert!(
             refused(Args {

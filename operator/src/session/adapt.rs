@@ -92,6 +92,9 @@ const FAR: f64 = 0.7;
 /// … up to so many of them.
 const FARTHEST: f64 = 3.0;
 
+/// … unless the samples around it are farther apart than this, s.
+const SEEN_S: f64 = 0.25;
+
 /// ln 2¹⁶.
 const MOST_LN_INFLATION: f64 = 11.09;
 
@@ -363,8 +366,10 @@ impl<C: Course> Adaptation<C> {
                 record.squared[WEIGHTED] += pending.weight * moved.norm_squared();
                 let e = said.fused - moved;
                 let out = e.dot(&(said.information * e)) / (REGION * self.ln_inflation.exp());
+                // Across a hole the truth is drawn, not seen.
+                let far = if span_s <= SEEN_S { FAR } else { 0.0 };
                 let missed = if out > 1.0 {
-                    1.0 + FAR * out.ln().min(FARTHEST)
+                    1.0 + far * out.ln().min(FARTHEST)
                 } else {
                     0.0
                 };

@@ -79,9 +79,9 @@ impl Default for SessionConfig {
 
 impl SessionConfig {
     /// The lease as it travels, ms: in steps of 10, rounded down.
-    pub(super) fn lease_ms(&self) -> u16 {
+    pub fn lease_ms(&self) -> u16 {
         // What is a step but for the last bit is one.
-        (self.lease_s * 1e2 + 1e-6) as u16 * 10
+        ((self.lease_s * 1e2 + 1e-6) as u16).saturating_mul(10)
     }
 }
 
