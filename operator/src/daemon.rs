@@ -142,6 +142,7 @@ impl Daemon {
         // Demanded, and not confirmed by the robot: outlives the session it was demanded in.
         let mut stop = false;
         let mut seen = None;
+        let mut took_leave = false;
         let mut endpoint = self.endpoint.clone();
         loop {
             let mut hung_up = quit.clone();
@@ -194,7 +195,10 @@ impl Daemon {
                 summary.seen = of_link;
             }
             match end {
-                End::Finished | End::Quit => break,
+                End::Finished | End::Quit => {
+                    took_leave = true;
+                    break;
+                }
                 End::Lost(why) => {
                     task.on_lost(&why);
                     let _ = notices.send(Notice::Lost { why });
@@ -205,7 +209,10 @@ impl Daemon {
             let news = lessons.news().await;
             self.news(news, &mut lessons, task, notices);
         }
-        endpoint.wait_idle().await;
+        // Attempts that nobody has answered need no farewell; QUIC would wait three seconds for theirs.
+        if took_leave {
+            endpoint.wait_idle().await;
+        }
         summary.outcome = task.outcome(*quit.borrow());
         if stop {
             summary.outcome = Outcome::Interrupted(
