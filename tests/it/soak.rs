@@ -104,6 +104,8 @@ struct Shift {
     /// When anything last happened that sessions may suffer from.
     disturbed_at: Mono,
     epoch: u32,
+    /// The last session that has ended.
+    ended: u32,
     path: Option<Path>,
     paths: BTreeMap<u32, Path>,
     tally: Tally,
@@ -167,6 +169,7 @@ impl Shift {
             clocks_are_right: true,
             disturbed_at: now,
             epoch: 0,
+            ended: 0,
             path: None,
             paths: BTreeMap::new(),
             tally: Tally::default(),
@@ -268,6 +271,7 @@ impl Shift {
                 RobotNotice::Path(path) => self.path = Some(path),
                 RobotNotice::Disconnected { why, clock, .. } => {
                     self.note(format!("session {} ends: {why}", self.epoch));
+                    self.ended = self.epoch;
                     if let Some(path) = self.path.take() {
                         self.paths.insert(self.epoch, path);
                     }

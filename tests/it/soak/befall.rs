@@ -1,5 +1,7 @@
 //! What befalls a shift.
 
+use tokio::time::Instant;
+
 use super::*;
 
 impl Shift {
@@ -30,7 +32,8 @@ impl Shift {
         let rtt_s: f64 = driver.links.iter().map(slowest_s).sum();
         let span_s = spread(&mut self.rng, 0.2, 20.0);
         self.outage(span_s).await;
-        let back = self.pair.now();
+        let (back, began, former) = (self.pair.now(), Instant::now(), self.epoch);
+        self.pair.network.log();
         let most_s = 2.0 * rtt_s + NEWS_S;
         let Some(before) = self.drivers.first().map(|d| d.telemetry) else {
             return;
@@ -43,13 +46,26 @@ impl Shift {
                 return;
             };
             let took_s = self.pair.now().secs_since(back) - 5e-3;
-            if driver.telemetry > before {
+            // Whose task was over has come to say goodbye.
+            let left = self.ended > former && driver.epoch == Some(self.ended);
+            if driver.telemetry > before || left {
                 self.tally.promises += 1;
                 self.tally.slowest_share = self.tally.slowest_share.max(took_s / most_s);
+                self.pair.network.logged();
                 return;
             }
             self.must(took_s <= most_s, || {
-                format!("{name}: no news {took_s:.3} s after an outage of {span_s:.3} s, RTT {rtt_s:.3} s")
+                let since_s = |at: Instant| at.duration_since(began).as_secs_f64();
+                let mut story = format!(
+                    "{name}: no news {took_s:.3} s after an outage of {span_s:.3} s, RTT {rtt_s:.3} s; since then:"
+                );
+                for p in self.pair.network.logged() {
+                    let way = if p.to == self.pair.robot_addr() { "up" } else { "down" };
+                    let arrives_s = p.arrives.map_or(f64::NAN, since_s);
+                    let sent_s = since_s(p.sent);
+                    story += &format!("\n    {sent_s:.4} → {arrives_s:.4} {way}, {} bytes", p.len_bytes);
+                }
+                story
             });
         }
     }
