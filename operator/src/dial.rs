@@ -19,7 +19,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until, timeout};
 
-/// Attempts begin this far apart, so that with [`HOLD`] none is greeted later than two round trips and 250 ms after the link's
+/// Attempts begin this far apart, so that with `HOLD` none is greeted later than two round trips and 250 ms after the link's
 /// return …
 pub const REDIAL: Duration = Duration::from_millis(230);
 
