@@ -185,10 +185,13 @@ class Person {
     assert.fail("the clutch was let go five times before the arm followed");
   }
 
-  /** Drags the hand along `path` until the arm is there, still holding it. */
+  /** Drags the hand along `path` until the arm is there, still holding it; to the same place however often it is let go on the way. */
   async drives(ms, path) {
+    let begun;
     for (let tries = 1; tries <= 5; tries++) {
-      await this.move(await this.engages(), ms, path);
+      const at = await this.engages();
+      begun ??= at;
+      await this.move(at, ms, (u) => path(u).map((v, i) => v + (begun[i] - at[i]) * ease(u)));
       if (await this.arrives()) return;
       console.log(`  let go by a page that was silent for too long (${tries})`);
       await this.pointer.up();

@@ -158,7 +158,7 @@ export class Fitts extends EventTarget {
     const rows = this.results.flatMap((r, i) => r.trials.map((t, k) => {
       const way = sub(t.to, t.from);
       const miss = dot(sub(t.end, t.to), unit(way));
-      return [i + 1, r.gain, r.targets, r.delay_ms.toFixed(1), r.nominal, k + 1, norm(way).toFixed(4), miss.toFixed(5), t.time_s.toFixed(3), r.width.toFixed(5), r.throughput.toFixed(3)].join(",");
+      return [i + 1, r.gain, r.targets, r.delay_ms.toFixed(1), r.nominal, k + 1, norm(way).toFixed(4), miss.toFixed(6), t.time_s.toFixed(3), r.width.toFixed(6), r.throughput.toFixed(3)].join(",");
     }));
     return [head, ...rows].join("\n") + "\n";
   }
