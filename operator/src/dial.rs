@@ -76,15 +76,21 @@ pub(crate) struct Link {
 impl Link {
     /// What is to be known of the link, once it is lost.
     pub(crate) fn seen(&self, before: Option<Seen>) -> Seen {
-        Seen {
-            rtt: quic::least_rtt(&self.connection),
-            answered: self.answered,
-            jitter: before.map_or(Duration::ZERO, |seen| seen.jitter),
-        }
+        Seen::of(quic::least_rtt(&self.connection), self.answered, before)
     }
 }
 
 impl Seen {
+    /// A link of which no jitter has been told yet has that of the one `before`.
+    fn of(rtt: Duration, answered: Duration, before: Option<Self>) -> Self {
+        let jitter = before.map_or(Duration::ZERO, |seen| seen.jitter);
+        Self {
+            rtt,
+            answered,
+            jitter,
+        }
+    }
+
     /// The least round trip counts: what a queue adds is no part of the path, and would have attempts wait for it.
     pub(crate) fn learn(&mut self, connection: &Connection) {
         self.shorten(quic::least_rtt(connection));
@@ -393,6 +399,21 @@ mod tests {
             );
         }
         assert_eq!(Pace::new(None).hold(ms(100)), HOLD);
+    }
+
+    #[test]
+    fn a_link_that_is_lost_before_it_told_its_jitter_has_the_one_befores() {
+        let ms = Duration::from_millis;
+        let jittering = |jitter_s| Received {
+            jitter_s,
+            ..Received::default()
+        };
+        let mut first = Seen::of(ms(100), ms(100), None);
+        first.jittered(Some(&jittering(0.02)), &jittering(0.01));
+        let mut second = Seen::of(ms(90), ms(95), Some(first));
+        assert_eq!(Pace::new(Some(second)).hold(ms(100)), ms(40));
+        second.jittered(None, &jittering(0.5));
+        assert_eq!(second.jitter, ms(10), "the robot has yet to say");
     }
 
     #[test]

@@ -276,3 +276,13 @@ fn a_state_that_no_integers_hold_is_not_sent() {
         assert_eq!(at(x, m), None, "{x} {m}");
     }
 }
+
+#[test]
+fn no_skills_tag_is_that_of_none() {
+    let mut id = [7; 16];
+    assert_eq!(model_tag(&id), 0x0707);
+    (id[0], id[1]) = (0, 0);
+    assert_eq!(model_tag(&id), 1);
+    id[1] = 2;
+    assert_eq!(model_tag(&id), 0x0200);
+}

@@ -18,7 +18,7 @@ async function pointers(browser, url, shots) {
   for (const [kind, pointer, end] of [["touch", touch, touch.up], ["touch", touch, touch.cancel], ["pen", await pen(page)]]) {
     person.pointer = pointer;
     const before = await person.now("arm.tip");
-    await person.drives(600, (u) => arc(u).map((v) => 0.6 * (end === touch.up ? v : -v)));
+    await person.drives(600, (u) => arc(u).map((v) => 0.4 * (end === touch.cancel ? -v : v)));
     assert.ok(distance(await person.now("arm.tip"), before) > 0.05, `${kind}: the arm went somewhere`);
     await (end ?? pointer.up)();
     await person.state("Ready");

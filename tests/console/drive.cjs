@@ -5,7 +5,7 @@ const { mkdirSync } = require("node:fs");
 const { join } = require("node:path");
 const { chromium } = require("playwright-core");
 const { accessible, blind, dimmed, pointers, readable, slow, task, throughput } = require("./checks.cjs");
-const { Person, arc, demo, distance, ease } = require("./person.cjs");
+const { Person, arc, demo, distance, ease, towards } = require("./person.cjs");
 const { Reader, stalled } = require("./wire.cjs");
 
 const [program, executablePath, shots] = process.argv.slice(2);
@@ -88,6 +88,8 @@ async function drive(person) {
   assert.ok(seen.every(([, phase]) => phase >= 0 && phase <= 1));
   await person.home();
   await person.pictured("following-light", (now) => now.robot.state === "Engaged" && now.knots.length > 3, 2500, sway);
+  // It may have been let go anywhere on the way.
+  await person.home();
 
   step("without prediction too");
   await page.click("#predict");
@@ -140,9 +142,11 @@ async function link(person, other) {
 
   step("a link that is suddenly slow: the arm coasts, and says so");
   const coasts = other.picture("coasting-light", (now) => now.robot.state === "Coasting");
+  let begun;
   for (let tries = 0, over = false; !over && tries < 6; tries++) {
     const at = await person.engages();
-    const moves = person.move(at, 1500, (u) => sway(u));
+    begun ??= at;
+    const moves = person.move(at, 1500, towards(begun, at, sway));
     await person.link(400);
     await moves;
     over = await Promise.race([coasts.then(() => true), person.until(() => telemime.link.now.arm.delay_ms > 300).then(() => false)]);

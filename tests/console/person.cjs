@@ -191,7 +191,7 @@ class Person {
     for (let tries = 1; tries <= 5; tries++) {
       const at = await this.engages();
       begun ??= at;
-      await this.move(at, ms, (u) => path(u).map((v, i) => v + (begun[i] - at[i]) * ease(u)));
+      await this.move(at, ms, towards(begun, at, path));
       if (await this.arrives()) return;
       console.log(`  let go by a page that was silent for too long (${tries})`);
       await this.pointer.up();
@@ -218,8 +218,11 @@ class Person {
   /** A picture while the hand is dragged along `path`; whether the clutch is still held after it does not matter. */
   async pictured(name, is, ms, path) {
     const taken = this.picture(name, is);
+    let begun;
     for (let seen = false; !seen; ) {
-      await this.move(await this.engages(), ms, path);
+      const at = await this.engages();
+      begun ??= at;
+      await this.move(at, ms, towards(begun, at, path));
       const letGo = this.until(() => telemime.drive.what === null).then(() => false, () => false);
       seen = await Promise.race([taken.then(() => true), letGo]);
       await this.released();
@@ -233,6 +236,8 @@ class Person {
 
 const ease = (u) => u * u * u * (10 - 15 * u + 6 * u * u);
 const arc = (u) => [90 * ease(u), -60 * Math.sin(Math.PI * ease(u))];
+/** `path` from `begun`, for who takes hold at `at`: what was cut short and is tried again does not add up, and ends in the arm's reach. */
+const towards = (begun, at, path) => (u) => path(u).map((v, i) => v + (begun[i] - at[i]) * ease(u));
 const distance = (a, b) => Math.hypot(...a.map((v, i) => v - b[i]));
 
-module.exports = { NEAR, Person, SOON, arc, demo, distance, ease, finger, pen };
+module.exports = { NEAR, Person, SOON, arc, demo, distance, ease, finger, pen, towards };

@@ -192,20 +192,21 @@ async fn write(
     mut send: SendStream,
     mut due: mpsc::Receiver<Vec<u8>>,
 ) -> bool {
-    while let Some(bytes) = due.recv().await {
-        let written = if bytes.len() > LONG {
-            write_long(&connection, &mut send, &bytes).await
-        } else {
-            send.write_all(&bytes).await
-        };
-        if written.is_err() {
-            return false;
+    let delivered = async {
+        while let Some(bytes) = due.recv().await {
+            if bytes.len() > LONG {
+                write_long(&connection, &mut send, &bytes).await
+            } else {
+                send.write_all(&bytes).await
+            }
+            .ok()?;
         }
-    }
-    let _ = send.finish();
-    match send.stopped().await {
-        Ok(stopped) => stopped.is_none(),
-        Err(_) => matches!(
+        send.finish().ok()?;
+        send.stopped().await.ok()
+    };
+    match delivered.await {
+        Some(stopped) => stopped.is_none(),
+        None => matches!(
             connection.close_reason(),
             Some(quinn::ConnectionError::ApplicationClosed(close)) if close.error_code == GOODBYE
         ),
@@ -299,5 +300,49 @@ async fn read_frames(
         // Nobody listening means the session is over already.
         let _ = tx.send(Err(end)).await;
         return;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::{Ipv4Addr, SocketAddr};
+
+    use super::*;
+    use crate::identity::Identity;
+    use crate::meter::Meter;
+    use crate::trust::Trust;
+
+    fn socket() -> quic::Socket {
+        quic::Socket::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap()
+    }
+
+    /// Whether what was written counts as heard by a peer that reads nothing of it and closes with `code`.
+    async fn heard(code: u32) -> bool {
+        let [ours, theirs] = [(); 2].map(|()| Identity::ephemeral().unwrap());
+        let trust = |peer: &Identity| Trust::new([peer.fingerprint()]);
+        let meter = Meter::default();
+        let robot = quic::server(&theirs, trust(&ours), socket(), &meter).unwrap();
+        let operator = quic::client(&ours, trust(&theirs), socket(), &meter).unwrap();
+        let dialled = async {
+            let connecting = operator.connect(robot.local_addr().unwrap(), "telemime");
+            connecting.unwrap().await.unwrap()
+        };
+        let accepted = async { robot.accept().await.unwrap().await.unwrap() };
+        let (connection, accepted) = tokio::join!(dialled, accepted);
+        let (writer, _frames) = Control::open(&connection).await.unwrap().into_frames();
+        // More than may be under way: some of it is never acknowledged.
+        writer.raw(vec![0; 1024 * 1024]).unwrap();
+        let control = Control::accept(&accepted).await.unwrap();
+        accepted.close(VarInt::from_u32(code), b"");
+        drop(control);
+        writer.finish(Duration::from_secs(60)).await
+    }
+
+    #[tokio::test]
+    async fn only_a_goodbye_says_that_all_is_heard() {
+        assert!(heard(0).await, "it has no more to hear");
+        for code in [1, 5, 9] {
+            assert!(!heard(code).await, "{code}");
+        }
     }
 }

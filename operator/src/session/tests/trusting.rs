@@ -75,3 +75,22 @@ fn what_abrupt_motion_taught_does_not_drown_what_smooth_motion_shows() {
     let [near, ..] = trust.params(&hand).weights;
     assert!(near[2] > 0.9, "{near:?}");
 }
+
+/// The factor of the covariance after a hand that kept still and then went `far_m` in `gap_s` without a sample.
+fn widened(gap_s: f64, far_m: f64) -> f64 {
+    let still = |_| Vector3::zeros();
+    let (hand, mut trust) = follow(Adaptation::of_places(1.0, None, 0.5), None, 60, still);
+    let mut there = hand;
+    let t = hand.t.offset_by_secs(gap_s);
+    assert!(there.advance(t, Vector3::new(far_m, 0.0, 0.0)));
+    let before = trust.params(&hand).inflation;
+    trust.observe(&hand, &there, None);
+    trust.params(&there).inflation / before
+}
+
+#[test]
+fn a_miss_by_far_widens_the_regions_but_not_across_a_hole() {
+    // As many are judged in both.
+    let [seen, hole] = [0.24, 0.26].map(|gap_s| widened(gap_s, 1.0));
+    assert!(seen > 1.5 * hole && hole > 1.0, "{seen} and {hole}");
+}
