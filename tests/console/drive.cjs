@@ -172,8 +172,7 @@ async function link(person, other) {
 async function stops(person, other) {
   const { page } = person;
   step("a page whose script hangs has let go");
-  await person.grab();
-  await other.state("Engaged");
+  await person.engages();
   await page.evaluate(() => { const until = performance.now() + 900; while (performance.now() < until); });
   await other.state("Ready");
   await other.noted("fell silent");
@@ -231,8 +230,7 @@ async function stops(person, other) {
   await person.state("Ready");
 
   step("a page that dies while it drives has let go");
-  await person.grab();
-  await other.state("Engaged");
+  await person.engages();
   await page.close();
   await other.state("Ready");
   await other.noted("the page that drove");
