@@ -417,8 +417,8 @@ impl Daemon {
         Ok(())
     }
 
-    /// Releases, says goodbye, and waits until the robot has it, but no longer than `within`. A stop is heard meanwhile, too:
-    /// what is said last on the stream is the goodbye, so it goes by datagram.
+    /// Releases, says goodbye, and waits until the robot has it, but no longer than `within`, nor once the user wants to quit
+    /// again. A stop is heard meanwhile, too: what is said last on the stream is the goodbye, so it goes by datagram.
     async fn leave(
         &self,
         (session, task): (&mut Session, &mut Task),
@@ -435,6 +435,7 @@ impl Daemon {
             ..
         } = link;
         let mut finish = pin!(writer.finish(within));
+        console.quit.mark_unchanged();
         let mut hears = true;
         let held = loop {
             while let Some(output) = session.poll_output() {
@@ -446,6 +447,7 @@ impl Daemon {
             tokio::select! {
                 biased;
                 held = &mut finish => break held,
+                Ok(()) = console.quit.changed() => break false,
                 Some(word) = console.words.recv() => if word == Word::Stop {
                     session.stop(self.now());
                 },

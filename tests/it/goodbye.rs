@@ -239,3 +239,27 @@ fn a_stop_that_nobody_heard_is_said_to_be_none() {
     };
     assert!(!stopped && why.contains("never confirmed"), "{why}");
 }
+
+#[test]
+fn who_quits_twice_does_not_wait_for_a_robot_that_hears_nothing() {
+    let link = delayed(0.1);
+    run_virtual(async {
+        let mut pair = Pair::start(&rig()).unwrap();
+        let config = SessionConfig::default();
+        let task = replay(unseen());
+        let operator = pair.operator(task, None, config, &link, 5).unwrap();
+        let follows = |r: &Report| r.state == RobotState::Engaged;
+        assert!(pair.wait_for(20.0, follows).await);
+        silence(&pair, &operator, &link, 5);
+        operator.quit();
+        pair.run_for(0.5).await;
+        assert!(!operator.done.is_finished(), "it waits");
+        let again = pair.now();
+        operator.quit();
+        let _ = finish(operator).await;
+        let took_s = (pair.now().0 - again.0) as f64 * 1e-9;
+        // QUIC's own farewell is three of its probe time-outs.
+        assert!(took_s < 2.0, "{took_s} s");
+    })
+    .unwrap();
+}

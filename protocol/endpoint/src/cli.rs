@@ -334,7 +334,7 @@ fn lines(mut from: impl BufRead) -> impl Iterator<Item = String> {
     })
 }
 
-/// Ctrl-C, SIGTERM, `quit`, or (if asked for) the end of stdin turn the watch true; the other words of `known`
+/// Ctrl-C, SIGTERM, `quit`, or (if asked for) the end of stdin turn the watch true, each of them anew; the other words of `known`
 /// arrive as such (`stop` is also called at once, on the reading thread). stdin is read only when it is a terminal or `follow_stdin` is set.
 ///
 /// # Errors
@@ -352,11 +352,13 @@ pub fn listen(
     );
     let by_signal = quit_tx.clone();
     tokio::spawn(async move {
-        tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
+        loop {
+            tokio::select! {
+                _ = interrupt.recv() => {}
+                _ = terminate.recv() => {}
+            }
+            by_signal.send_replace(true);
         }
-        by_signal.send_replace(true);
     });
     if follow_stdin || io::stdin().is_terminal() {
         // A thread of its own, never joined: a blocking read cannot be cancelled, and ends with the process.
