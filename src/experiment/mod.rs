@@ -182,15 +182,28 @@ fn read(name: &str) -> anyhow::Result<Plan> {
 
 fn execute(args: &Args, name: &str, plan: &Plan, thinned: &str) -> anyhow::Result<()> {
     let rigs = rigs(plan)?;
-    let learned = AtomicUsize::new(0);
-    let subjects = subject::subjects(plan, |all| {
-        let n = learned.fetch_add(1, Ordering::Relaxed) + 1;
-        eprintln!("learned {n} of {all} skills");
-    })?;
-    let runs = list(plan, &subjects);
+    let materials = subject::materials(plan)?;
+    let skills = materials.len();
+    let total = plan.cells.len() * skills;
     let Shard { part, of } = args.shard;
-    let total = runs.len();
-    let own = runs.into_iter().filter(|run| run.number % of == part % of);
+    let is_own = |number: usize| number % of == part % of;
+    if args.dry_run {
+        say!(
+            "{}: {total} runs, {} here: {} settings, {skills} skills",
+            plan.title,
+            (1..=total).filter(|&n| is_own(n)).count(),
+            plan.cells.len(),
+        );
+        return Ok(());
+    }
+    let learned = AtomicUsize::new(0);
+    let subjects = subject::subjects(materials, plan.seed, || {
+        let n = learned.fetch_add(1, Ordering::Relaxed) + 1;
+        eprintln!("learned {n} of {skills} skills");
+    })?;
+    let own = list(plan, &subjects)
+        .into_iter()
+        .filter(|run| is_own(run.number));
     let stem = Path::new(name).file_stem().unwrap_or_default();
     let out = args.out.clone().unwrap_or_else(|| {
         let mut folder = stem.to_owned();
@@ -203,16 +216,6 @@ fn execute(args: &Args, name: &str, plan: &Plan, thinned: &str) -> anyhow::Resul
         Path::new(OUT).join(folder)
     });
     let own: Vec<_> = own.collect();
-    if args.dry_run {
-        say!(
-            "{}: {total} runs, {} here: {} settings, {} skills",
-            plan.title,
-            own.len(),
-            plan.cells.len(),
-            subjects.len()
-        );
-        return Ok(());
-    }
     let manifest = Manifest {
         title: plan.title.clone(),
         plan: Path::new(name)

@@ -51,7 +51,7 @@ pub(super) enum SubjectError {
 }
 
 /// What a subject is made of.
-struct Material {
+pub(super) struct Material {
     name: String,
     person: String,
     learn: Vec<Demonstration>,
@@ -59,23 +59,28 @@ struct Material {
     off_model: Demonstration,
 }
 
-/// Everybody the plan drives, in order; `progress` hears of each skill learned, from any thread.
-pub(super) fn subjects(
-    plan: &Plan,
-    progress: impl Fn(usize) + Sync,
-) -> Result<Vec<Subject>, SubjectError> {
+/// Everybody the plan drives, in order.
+pub(super) fn materials(plan: &Plan) -> Result<Vec<Material>, SubjectError> {
     let mut materials = if plan.motion.folders.is_empty() {
         generated(plan)?
     } else {
         recorded(&plan.motion, plan.seed)?
     };
     materials.truncate(plan.motion.most.unwrap_or(usize::MAX));
-    let all = materials.len();
+    Ok(materials)
+}
+
+/// Learns their skills; `progress` hears of each, from any thread.
+pub(super) fn subjects(
+    materials: Vec<Material>,
+    seed: u64,
+    progress: impl Fn() + Sync,
+) -> Result<Vec<Subject>, SubjectError> {
     materials
         .into_par_iter()
         .map(|material| {
-            let subject = learn(material, plan.seed);
-            progress(all);
+            let subject = learn(material, seed);
+            progress();
             subject
         })
         .collect()

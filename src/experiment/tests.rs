@@ -222,7 +222,7 @@ fn whoever_follows_meets_the_same_link_at_the_same_moment_of_the_hand() {
     let plan = "[motion]\npeople = 1\nperformances = 2\n[factors]\nmotion = \"on-model\"\nmethod = [\"ours\", \"hold\", \"kalman\"]\n\
                 link = [\"delay 20ms outage 2s..2.4s every 3s\", \"trace series.csv\"]\ninput_latency = [\"0ms\", \"50ms\"]\n";
     let plan = Plan::parse("moments", plan, scratch.path()).unwrap();
-    let subjects = subject::subjects(&plan, |_| ()).unwrap();
+    let subjects = subject::subjects(subject::materials(&plan).unwrap(), plan.seed, || ()).unwrap();
     let rigs = rigs(&plan).unwrap();
     let rig = rigs.values().next().unwrap();
     let mut kinds = std::collections::BTreeSet::new();
