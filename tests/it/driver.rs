@@ -32,6 +32,18 @@ fn command(script: &str, first: &str) -> Option<String> {
     ))
 }
 
+/// Other work on this computer is not what is tried here: the driver has time.
+fn flags<'a>(driver: &'a str, boxes: &'a str) -> [&'a str; 6] {
+    [
+        "--driver",
+        driver,
+        "--driver-patience",
+        "2s",
+        "--black-box",
+        boxes,
+    ]
+}
+
 #[test]
 fn the_documented_driver_is_driven_and_its_record_replays() {
     let _alone = alone();
@@ -40,16 +52,7 @@ fn the_documented_driver_is_driven_and_its_record_replays() {
     };
     let (stage, boxes) = (Stage::new(), tempfile::tempdir().unwrap());
     let folder = boxes.path().to_str().unwrap();
-    // Other work on this computer is not what is tried here.
-    let flags = [
-        "--driver",
-        &driver,
-        "--driver-patience",
-        "2s",
-        "--black-box",
-        folder,
-    ];
-    let (robot, addr) = stage.robot_with(&flags);
+    let (robot, addr) = stage.robot_with(&flags(&driver, folder));
     let greeted = robot.event("driver");
     assert_eq!(greeted["rate_hz"], 250.0);
     let operator = stage.operator(&addr, "operator");
@@ -130,15 +133,7 @@ fn a_driver_that_fails_stops_the_arm_with_its_reason_and_an_exit_code() {
         };
         let (stage, boxes) = (Stage::new(), tempfile::tempdir().unwrap());
         let folder = boxes.path().to_str().unwrap();
-        let flags = [
-            "--driver",
-            &driver,
-            "--driver-patience",
-            "2s",
-            "--black-box",
-            folder,
-        ];
-        let (robot, _) = stage.robot_with(&flags);
+        let (robot, _) = stage.robot_with(&flags(&driver, folder));
         let fault = robot.event("arm_fault");
         let found = &fault["fault"];
         assert!(found == kind || found[kind].is_object(), "{how}: {fault}");

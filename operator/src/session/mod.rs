@@ -17,7 +17,7 @@ mod path;
 mod said;
 mod speak;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod usual;
 mod view;
 

@@ -34,7 +34,7 @@ struct Bench {
     events: Vec<Event>,
 }
 
-fn info(model: Option<ModelId>) -> Info {
+pub(crate) fn info(model: Option<ModelId>) -> Info {
     Info {
         name: "bench".into(),
         joints: 7,
@@ -44,6 +44,18 @@ fn info(model: Option<ModelId>) -> Info {
         lag_s: 0.07,
         model,
         state: RobotState::Ready,
+    }
+}
+
+/// A grant that moves nothing.
+fn granted(engagement: u32) -> RobotControl {
+    RobotControl::Engaged {
+        engagement,
+        t_us: 0,
+        hand_m: [0.0; 3],
+        tip_m: [0.0; 3],
+        hand_q: None,
+        tip_q: WireRotation::default(),
     }
 }
 
@@ -97,14 +109,7 @@ impl Bench {
     /// Asks for engagement 1, which is granted.
     fn grant(&mut self) {
         self.session.engage(self.now);
-        self.hears(&RobotControl::Engaged {
-            engagement: 1,
-            t_us: 0,
-            hand_m: [0.0; 3],
-            tip_m: [0.0; 3],
-            hand_q: None,
-            tip_q: WireRotation::default(),
-        });
+        self.hears(&granted(1));
         self.hears(&RobotControl::State {
             state: RobotState::Engaged,
             cause: Cause::Requested,
@@ -213,14 +218,7 @@ const LEFT: RobotControl = RobotControl::State {
 
 #[test]
 fn an_arm_that_holds_from_before_ends_nothing_that_is_only_being_asked_for() {
-    let granted = RobotControl::Engaged {
-        engagement: 1,
-        t_us: 0,
-        hand_m: [0.0; 3],
-        tip_m: [0.0; 3],
-        hand_q: None,
-        tip_q: WireRotation::default(),
-    };
+    let granted = granted(1);
     let mut bench = Bench::ready(SessionConfig::default(), None);
     let t: Vec<f64> = (0..50).map(|i| f64::from(i) * 0.1).collect();
     let x: Vec<_> = t.iter().map(|&t| home() * (0.1 * t)).collect();

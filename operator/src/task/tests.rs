@@ -1,29 +1,31 @@
 use nalgebra::Vector3;
 use telemime_protocol::checkpoint::select;
 use telemime_protocol::wire::frame::Frame;
-use telemime_protocol::wire::v1::{Info, Message, RobotControl};
+use telemime_protocol::wire::v1::{Message, RobotControl};
 
 use super::*;
 use crate::session::SessionConfig;
+use crate::session::tests::info;
 
 pub(crate) fn ready() -> Session {
     let mut session = Session::new(SessionConfig::default(), None, 1);
-    let info = Info {
-        name: "bench".into(),
-        joints: 7,
-        speed_m_s: 1.7,
-        accel_m_s2: 13.0,
-        radius_m: 0.3,
-        lag_s: 0.07,
-        model: None,
-        state: RobotState::Ready,
-    };
     let frame = Frame {
         ignorable: false,
-        payload: RobotControl::Info(info).encode(),
+        payload: RobotControl::Info(info(None)).encode(),
     };
     session.handle_control(Stamp::ZERO, &frame).unwrap();
     session
+}
+
+fn granted() -> Event {
+    Event::Engaged {
+        engagement: 1,
+        t_us: 0,
+        hand_m: [0.0; 3],
+        tip_m: [0.0; 3],
+        hand_q: None,
+        tip_q: nalgebra::UnitQuaternion::identity(),
+    }
 }
 
 fn at(ms: i64) -> Stamp {
@@ -95,15 +97,7 @@ fn after_a_hold_or_a_stop_nothing_is_asked_again() {
         let mut now = at(0);
         task.advise(now, &mut session);
         assert_eq!(task.phase, Phase::Asked);
-        let engaged = Event::Engaged {
-            engagement: 1,
-            t_us: 0,
-            hand_m: [0.0; 3],
-            tip_m: [0.0; 3],
-            hand_q: None,
-            tip_q: nalgebra::UnitQuaternion::identity(),
-        };
-        task.on_event(now, &engaged);
+        task.on_event(now, &granted());
         task.on_event(now, &event);
         while let Some(due) = task.poll_timeout() {
             now = due;
@@ -122,15 +116,7 @@ fn until_said(task: &mut Task, session: &mut Session, now: &mut Stamp) -> Advice
     loop {
         let advice = task.advise(*now, session);
         if task.phase == Phase::Asked {
-            let engaged = Event::Engaged {
-                engagement: 1,
-                t_us: 0,
-                hand_m: [0.0; 3],
-                tip_m: [0.0; 3],
-                hand_q: None,
-                tip_q: nalgebra::UnitQuaternion::identity(),
-            };
-            task.on_event(*now, &engaged);
+            task.on_event(*now, &granted());
         }
         if advice != Advice::Continue {
             return advice;

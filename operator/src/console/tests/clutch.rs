@@ -9,11 +9,12 @@ use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::frame::Frame;
 use telemime_protocol::wire::turn::WireRotation;
 use telemime_protocol::wire::v1::{
-    Cause, Info, Message, OperatorControl, OperatorDatagram, Refusal, RobotControl, RobotState,
+    Cause, Message, OperatorControl, OperatorDatagram, Refusal, RobotControl, RobotState,
 };
 
 use super::super::live::{Known, LEASE_S};
 use super::super::{Act, Command, Holding, Live, Port, Said, seat};
+use crate::session::tests::info;
 use crate::session::{Output, Session, SessionConfig};
 
 const MS: i64 = 1_000_000;
@@ -55,16 +56,7 @@ impl Bench {
             control: Vec::new(),
             motions: 0,
         };
-        bench.hears(&RobotControl::Info(Info {
-            name: "bench".into(),
-            joints: 7,
-            speed_m_s: 1.7,
-            accel_m_s2: 13.0,
-            radius_m: 0.3,
-            lag_s: 0.07,
-            model: None,
-            state: RobotState::Ready,
-        }));
+        bench.hears(&RobotControl::Info(info(None)));
         bench
     }
 

@@ -82,17 +82,6 @@ fn every_refusal_but_a_divergence_ends_the_attempt() {
     }
 }
 
-fn granted(engagement: u32) -> RobotControl {
-    RobotControl::Engaged {
-        engagement,
-        t_us: 0,
-        hand_m: [0.0; 3],
-        tip_m: [0.0; 3],
-        hand_q: None,
-        tip_q: WireRotation::default(),
-    }
-}
-
 /// A trigger that bounces: the second request is declined while the third is under way, which is then granted.
 #[test]
 fn what_is_granted_after_it_was_given_up_is_let_go() {
@@ -301,14 +290,7 @@ fn a_plan_is_engaged_once_stored_and_kept_going() {
         })
         .collect();
     assert_eq!(bench.datagrams, expected);
-    bench.hears(&RobotControl::Engaged {
-        engagement: 1,
-        t_us: 0,
-        hand_m: [0.0; 3],
-        tip_m: [0.0; 3],
-        hand_q: None,
-        tip_q: WireRotation::default(),
-    });
+    bench.hears(&granted(1));
     bench.hears(&state(RobotState::Ready, Cause::PlanFinished));
     bench.forget();
     bench.idle(1000);

@@ -27,14 +27,7 @@ fn trust(watched: usize) -> (Trust, Vec<(f64, Trust)>) {
         panic!("{:?}", engage.drive)
     };
     let asked = params.weights.map(|w| w[0]);
-    bench.hears(&RobotControl::Engaged {
-        engagement: 1,
-        t_us: 0,
-        hand_m: [0.0; 3],
-        tip_m: [0.0; 3],
-        hand_q: None,
-        tip_q: WireRotation::default(),
-    });
+    bench.hears(&granted(1));
     for _ in 0..60 {
         bench.sample(home());
     }
