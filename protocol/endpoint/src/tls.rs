@@ -180,3 +180,88 @@ pub fn client(
     config.resumption = rustls::client::Resumption::disabled();
     Ok(config)
 }
+
+#[cfg(test)]
+mod tests {
+    use rcgen::{CertificateParams, KeyPair, PKCS_ECDSA_P256_SHA256, PKCS_ED25519};
+    use rustls::client::ResolvesClientCert;
+    use rustls::pki_types::PrivateKeyDer;
+    use rustls::sign::{CertifiedKey, Signer, SigningKey};
+    use rustls::{ClientConfig, ClientConnection, ServerConnection, SignatureAlgorithm};
+
+    use super::*;
+
+    /// Signs by its own scheme, whatever is asked for.
+    #[derive(Debug)]
+    struct Stubborn(Arc<dyn SigningKey>);
+
+    impl SigningKey for Stubborn {
+        fn choose_scheme(&self, _: &[SignatureScheme]) -> Option<Box<dyn Signer>> {
+            use SignatureScheme::{ECDSA_NISTP256_SHA256, ED25519};
+            self.0.choose_scheme(&[ED25519, ECDSA_NISTP256_SHA256])
+        }
+
+        fn algorithm(&self) -> SignatureAlgorithm {
+            self.0.algorithm()
+        }
+    }
+
+    #[derive(Debug)]
+    struct Only(Arc<CertifiedKey>);
+
+    impl ResolvesClientCert for Only {
+        fn resolve(&self, _: &[&[u8]], _: &[SignatureScheme]) -> Option<Arc<CertifiedKey>> {
+            Some(self.0.clone())
+        }
+
+        fn has_certs(&self) -> bool {
+            true
+        }
+    }
+
+    /// What a robot that trusts `key` makes of an operator that signs with it.
+    fn greeted(key: &KeyPair) -> Result<(), Error> {
+        let certificate = CertificateParams::default().self_signed(key).unwrap();
+        let certificate = certificate.der().clone();
+        let spki = ParsedCertificate::try_from(&certificate)
+            .unwrap()
+            .subject_public_key_info();
+        let robot = Identity::ephemeral().unwrap();
+        let trusted = Trust::new([Fingerprint::of_spki(&spki)]);
+        let verifier = Pinned::new(Trust::new([robot.fingerprint()]));
+        let private = PrivateKeyDer::try_from(key.serialize_der()).unwrap();
+        let signing = verifier.provider.key_provider.load_private_key(private);
+        let signing = Arc::new(Stubborn(signing.unwrap()));
+        let own = CertifiedKey::new(vec![certificate], signing);
+        let config = ClientConfig::builder_with_provider(verifier.provider.clone())
+            .with_protocol_versions(&[&rustls::version::TLS13])
+            .unwrap()
+            .dangerous()
+            .with_custom_certificate_verifier(verifier)
+            .with_client_cert_resolver(Arc::new(Only(Arc::new(own))));
+        let config = Arc::new(config);
+        let name = ServerName::try_from("telemime").unwrap();
+        let mut operator = ClientConnection::new(config, name).unwrap();
+        let config = Arc::new(server(&robot, trusted, &[]).unwrap());
+        let mut robot = ServerConnection::new(config).unwrap();
+        while operator.is_handshaking() || robot.is_handshaking() {
+            let mut said = Vec::new();
+            operator.write_tls(&mut said).unwrap();
+            robot.read_tls(&mut &said[..]).unwrap();
+            robot.process_new_packets()?;
+            said.clear();
+            robot.write_tls(&mut said).unwrap();
+            operator.read_tls(&mut &said[..]).unwrap();
+            operator.process_new_packets().unwrap();
+        }
+        Ok(())
+    }
+
+    #[test]
+    fn a_trusted_key_of_another_scheme_is_refused() {
+        let key = |algorithm| KeyPair::generate_for(algorithm).unwrap();
+        assert_eq!(greeted(&key(&PKCS_ED25519)), Ok(()));
+        let unasked = PeerMisbehaved::SignedHandshakeWithUnadvertisedSigScheme;
+        assert_eq!(greeted(&key(&PKCS_ECDSA_P256_SHA256)), Err(unasked.into()));
+    }
+}
