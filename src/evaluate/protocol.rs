@@ -201,9 +201,15 @@ impl Plan<'_> {
     }
 
     fn rounds_of(&self, set: usize) -> Vec<Round> {
-        let all: Vec<usize> = (0..self.sets[set].demonstrations.len()).collect();
+        let recordings = &self.sets[set].demonstrations;
+        let all: Vec<usize> = (0..recordings.len()).collect();
         let round = |test: Vec<usize>, from: &[usize]| {
-            let others = from.iter().filter(|n| !test.contains(n));
+            // Nor a copy of what it is tried on.
+            let tried = |n: usize| {
+                let hash = recordings[n].sha256();
+                test.iter().any(|t| recordings[*t].sha256() == hash)
+            };
+            let others = from.iter().filter(|n| !tried(**n));
             let learn: Vec<usize> = others.take(self.most).copied().collect();
             (!learn.is_empty()).then_some(Round {
                 set,

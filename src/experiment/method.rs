@@ -50,14 +50,19 @@ impl fmt::Display for Method {
             Self::Ours => "ours",
             Self::Hold => "hold",
             Self::Deadband(share) if *share == SHARE => "deadband",
-            Self::Deadband(share) => return write!(f, "deadband {}%", share * 100.0),
+            Self::Deadband(share) => return write!(f, "deadband {}%", percent(*share)),
             Self::Velocity(share) if *share == 1.0 => "velocity",
-            Self::Velocity(share) => return write!(f, "velocity {}%", share * 100.0),
+            Self::Velocity(share) => return write!(f, "velocity {}%", percent(*share)),
             Self::Kalman => "kalman",
             Self::Playback => "playback",
             Self::Floor => "floor",
         })
     }
+}
+
+/// As it was written: 7 % is no binary fraction.
+fn percent(share: f64) -> f64 {
+    (share * 1e11).round() / 1e9
 }
 
 impl FromStr for Method {

@@ -69,7 +69,7 @@ pub(crate) struct Args {
     #[arg(long)]
     dry_run: bool,
     /// List the ready plans, and every factor a plan may name.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "json")]
     list: bool,
     /// Print a ready plan, to be changed.
     #[arg(long, value_name = "NAME")]
@@ -188,12 +188,16 @@ fn execute(args: &Args, name: &str, plan: &Plan, thinned: &str) -> anyhow::Resul
     let Shard { part, of } = args.shard;
     let is_own = |number: usize| number % of == part % of;
     if args.dry_run {
-        say!(
-            "{}: {total} runs, {} here: {} settings, {skills} skills",
-            plan.title,
-            (1..=total).filter(|&n| is_own(n)).count(),
-            plan.cells.len(),
-        );
+        let here = (1..=total).filter(|&n| is_own(n)).count();
+        let (title, settings) = (&plan.title, plan.cells.len());
+        if args.json {
+            say!(
+                "{}",
+                serde_json::json!({ "title": title, "runs": total, "here": here, "settings": settings, "skills": skills })
+            );
+        } else {
+            say!("{title}: {total} runs, {here} here: {settings} settings, {skills} skills");
+        }
         return Ok(());
     }
     let learned = AtomicUsize::new(0);

@@ -112,9 +112,25 @@ pub(super) enum Problem {
     Folder(PathBuf),
     #[error("`{0}` names no value")]
     Nothing(String),
+    #[error(
+        "`{key}` does nothing {}",
+        if *recorded { "beside `folders`: recordings are driven, and nobody is generated" } else { "without `folders`: nothing recorded is driven" }
+    )]
+    Idle { key: String, recorded: bool },
     #[error("these factors make {0} runs a person; at most {MOST_RUNS}")]
     TooMany(usize),
 }
+
+/// Keys of `motion` that mean something for generated people only, and beside `folders` only.
+const OF_GENERATED: [&str; 3] = ["people", "performances", "wrist"];
+const OF_RECORDED: [&str; 6] = [
+    "off_model",
+    "match",
+    "group_by",
+    "learn_from",
+    "every",
+    "axes",
+];
 
 type Value<'a> = Spanned<DeValue<'a>>;
 
@@ -161,8 +177,13 @@ impl Plan {
 
     /// SHA-256 of the text, in hexadecimal digits.
     pub(super) fn hash(&self) -> String {
-        hex(&Sha256::digest(&self.text))
+        sha256(&self.text)
     }
+}
+
+/// SHA-256 of a plan's text, in hexadecimal digits.
+pub(super) fn sha256(text: &str) -> String {
+    hex(&Sha256::digest(text))
 }
 
 /// Hexadecimal digits.
@@ -237,8 +258,25 @@ impl Reader<'_> {
     }
 
     fn motion(&self, value: &Value<'_>, motion: &mut Motion) -> Result<(), PlanError> {
-        for (key, value) in self.table("motion", value)? {
+        let table = self.table("motion", value)?;
+        let recorded = table.contains_key("folders");
+        for (key, value) in table {
             let name = key.get_ref().as_ref();
+            let idle = if recorded {
+                &OF_GENERATED[..]
+            } else {
+                &OF_RECORDED
+            };
+            if idle.contains(&name) {
+                let key_of = name.to_owned();
+                return Err(self.wrong(
+                    key.span(),
+                    Problem::Idle {
+                        key: key_of,
+                        recorded,
+                    },
+                ));
+            }
             match name {
                 "people" => motion.people = self.count(name, value, 1)?,
                 "performances" => motion.performances = self.count(name, value, 1)? as u32,
@@ -278,7 +316,10 @@ impl Reader<'_> {
     }
 
     fn factors(&self, value: &Value<'_>, values: &mut Values) -> Result<(), PlanError> {
-        for (key, value) in self.table("factors", value)? {
+        let mut named: Vec<_> = self.table("factors", value)?.iter().collect();
+        // What is said of one direction counts, wherever it stands.
+        named.sort_by_key(|(key, _)| key.get_ref() != LINK);
+        for (key, value) in named {
             let name = key.get_ref().as_ref();
             let mut list = Vec::new();
             match value.get_ref().as_array() {
@@ -405,13 +446,13 @@ impl Reader<'_> {
     fn scalar(&self, name: &str, value: &Value<'_>) -> Result<String, PlanError> {
         match value.get_ref() {
             DeValue::String(text) => Ok(text.trim().to_owned()),
-            DeValue::Integer(number) => Ok(number.as_str().to_owned()),
+            DeValue::Integer(number) if number.radix() == 10 => Ok(number.as_str().to_owned()),
             DeValue::Float(number) => Ok(number.as_str().to_owned()),
             DeValue::Boolean(flag) => Ok(flag.to_string()),
             _ => Err(self.type_of(
                 value,
                 name,
-                "a text, a number, true or false, or a list of these",
+                "a text, a decimal number, true or false, or a list of these",
             )),
         }
     }
@@ -425,6 +466,7 @@ impl Reader<'_> {
     fn whole(&self, name: &str, value: &Value<'_>) -> Result<u64, PlanError> {
         let number = value.get_ref().as_integer();
         number
+            .filter(|n| n.radix() == 10)
             .and_then(|n| n.as_str().parse().ok())
             .ok_or_else(|| self.type_of(value, name, "a whole number from 0 on"))
     }

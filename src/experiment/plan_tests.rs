@@ -44,6 +44,24 @@ fn a_case_changes_only_what_it_names() {
 }
 
 #[test]
+fn what_is_said_of_one_direction_counts_wherever_it_stands() {
+    for way in ["up", "down"] {
+        let plan = parse(&format!(
+            "[factors]\n{way} = \"delay 50ms\"\nlink = \"perfect\"\n"
+        ));
+        let cells = plan.unwrap().cells;
+        let ours = cells.iter().find(|c| of(&c.texts, "method") == "ours");
+        let delays = ours.map(|c| (c.settings.up.delay_s, c.settings.down.delay_s));
+        let expected = if way == "up" {
+            (0.05, 0.0)
+        } else {
+            (0.0, 0.05)
+        };
+        assert_eq!(delays, Some(expected));
+    }
+}
+
+#[test]
 fn what_is_wrong_is_named_with_its_line() {
     for (text, said) in [
         ("[factors]\ndelay = 3\n", "a.toml:2: unknown factor `delay`"),
@@ -70,6 +88,19 @@ fn what_is_wrong_is_named_with_its_line() {
         ),
         ("[factors]\nlink_seed = \"9..2\"\n", "a.toml:2: link_seed"),
         ("[factors]\nmethod = \"ours\n", "a.toml:2:"),
+        (
+            "[motion]\npeople = 2\nevery = true\n",
+            "a.toml:3: `every` does nothing without `folders`",
+        ),
+        (
+            "[motion]\nfolders = [\".\"]\nwrist = true\n",
+            "a.toml:3: `wrist` does nothing beside `folders`",
+        ),
+        ("seed = 0x10\n", "a.toml:1: `seed` must be"),
+        (
+            "[factors]\nlink_seed = 0x11\n",
+            "a.toml:2: `link_seed` must be",
+        ),
         (
             "[factors]\nlink_seed = \"1..1000000\"\nscale = [0.1, 0.2]\n",
             "runs a person",

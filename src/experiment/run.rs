@@ -15,7 +15,7 @@ use super::method::Method;
 use super::plan::{Cell, Plan, hex};
 use super::real::{self, Ground, RealError};
 use super::row::Row;
-use super::store::{Store, StoreError};
+use super::store::{SKILL, Store, StoreError};
 use super::subject::{Subject, SubjectError};
 use super::trace::Outcome;
 use super::{baseline, drive};
@@ -30,6 +30,11 @@ pub(super) enum RunError {
     Rig(#[from] RigError),
     #[error(transparent)]
     Store(#[from] StoreError),
+    #[error("{path}: {source}")]
+    Input {
+        path: PathBuf,
+        source: std::io::Error,
+    },
     #[error("run {id}: {source}")]
     Ground { id: String, source: PairError },
     #[error("run {id}: {source}")]
@@ -236,15 +241,19 @@ fn one(
 pub(super) fn inputs(
     plan: &Plan,
     subjects: &[Subject],
-) -> std::io::Result<BTreeMap<String, String>> {
+) -> Result<BTreeMap<String, String>, RunError> {
     let mut inputs = BTreeMap::new();
+    let hash = |path: PathBuf| match std::fs::read(&path) {
+        Ok(bytes) => Ok(hex(&Sha256::digest(bytes))),
+        Err(source) => Err(RunError::Input { path, source }),
+    };
     let short = |path: &Path| {
         let short = path.strip_prefix(&plan.folder).unwrap_or(path);
         short.display().to_string()
     };
     for cell in &plan.cells {
         if let Some(path) = &cell.settings.arm {
-            inputs.insert(short(path), hex(&Sha256::digest(std::fs::read(path)?)));
+            inputs.insert(short(path), hash(path.clone())?);
         }
     }
     for link in plan
@@ -254,7 +263,7 @@ pub(super) fn inputs(
     {
         if let Some(trace) = &link.trace {
             let path = trace.path();
-            inputs.insert(short(path), hex(&Sha256::digest(std::fs::read(path)?)));
+            inputs.insert(short(path), hash(plan.folder.join(path))?);
         }
     }
     if !plan.motion.folders.is_empty() {
@@ -262,7 +271,7 @@ pub(super) fn inputs(
             for d in [&subject.on_model, &subject.off_model] {
                 inputs.insert(short(d.path()), hex(d.sha256()));
             }
-            let skill = format!("skill: {}", subject.name);
+            let skill = format!("{SKILL}{}", subject.name);
             inputs.insert(skill, hex(&subject.skill.id().0));
         }
     }

@@ -46,7 +46,15 @@ pub(super) struct Manifest {
     pub(super) host: Host,
 }
 
+/// Before the name of a skill among a manifest's inputs.
+pub(super) const SKILL: &str = "skill: ";
+
 impl Manifest {
+    /// Whether recorded hands were driven, and not generated ones.
+    pub(super) fn is_of_recordings(&self) -> bool {
+        self.inputs.keys().any(|input| input.starts_with(SKILL))
+    }
+
     /// How much of the plan, and on which ground.
     pub(super) fn part(&self) -> String {
         match self.thinned.as_str() {
@@ -112,6 +120,12 @@ pub(super) enum StoreError {
         run: usize,
         runs: usize,
     },
+    #[error(
+        "{0}: is there and is not this plan; nothing is overwritten: choose another folder with -o"
+    )]
+    Taken(PathBuf),
+    #[error("{path}: is not the plan that was run (its SHA-256 is another): put that back")]
+    Edited { path: PathBuf },
     #[error("{0}: another process is writing there")]
     Busy(PathBuf),
     #[error(
@@ -171,7 +185,7 @@ impl Store {
             return Ok(Found::Complete(rows));
         }
         if !dir.join(MANIFEST).exists() {
-            write_whole(&dir.join(PLAN), plan.as_bytes())?;
+            write_plan(dir, plan)?;
             write_manifest(dir, manifest)?;
         }
         Self::part(dir, lock).map(|store| Found::Open(Box::new(store)))
@@ -321,6 +335,9 @@ pub(super) fn read(dir: &Path) -> Result<(Manifest, String, Vec<Row>), StoreErro
     }
     let path = dir.join(PLAN);
     let plan = std::fs::read_to_string(&path).map_err(io_at(&path))?;
+    if super::plan::sha256(&plan) != manifest.plan_sha256 {
+        return Err(StoreError::Edited { path });
+    }
     let rows = whole(&results, &manifest)?;
     for row in &rows {
         check_series(&series_path(dir, &row.id))?;
@@ -418,11 +435,22 @@ pub(super) fn merge(out: &Path, dirs: &[PathBuf]) -> Result<usize, StoreError> {
         }
     }
     manifest.shard = ALL.into();
-    write_whole(&out.join(PLAN), plan.as_bytes())?;
+    write_plan(out, &plan)?;
     write_manifest(out, &manifest)?;
     let rows: Vec<Row> = rows.into_values().map(|(row, _)| row).collect();
     write_results(out, &rows)?;
     Ok(rows.len())
+}
+
+/// The plan beside its results; somebody's own file of that name stays.
+fn write_plan(dir: &Path, plan: &str) -> Result<(), StoreError> {
+    let path = dir.join(PLAN);
+    match std::fs::read(&path) {
+        Ok(there) if there != plan.as_bytes() => Err(StoreError::Taken(path)),
+        Ok(_) => Ok(()),
+        Err(e) if e.kind() == io::ErrorKind::NotFound => write_whole(&path, plan.as_bytes()),
+        Err(e) => Err(io_at(&path)(e)),
+    }
 }
 
 fn write_results(dir: &Path, rows: &[Row]) -> Result<(), StoreError> {

@@ -40,6 +40,8 @@ pub(super) struct Subject {
 pub(super) enum SubjectError {
     #[error(transparent)]
     Read(#[from] DemonstrationError),
+    #[error("{folder}: two folders are called {name}; rename one")]
+    Alike { folder: String, name: String },
     #[error(
         "{folder}: nobody in it performed twice, as {pattern} finds persons in the file names: one recording to learn from and one to drive are needed"
     )]
@@ -66,7 +68,19 @@ pub(super) fn materials(plan: &Plan) -> Result<Vec<Material>, SubjectError> {
     } else {
         recorded(&plan.motion, plan.seed)?
     };
-    materials.truncate(plan.motion.most.unwrap_or(usize::MAX));
+    if let Some(most) = plan.motion.most {
+        let mut people: Vec<String> = Vec::new();
+        materials.retain(|material| {
+            if people.contains(&material.person) {
+                return true;
+            }
+            let one_more = people.len() < most;
+            if one_more {
+                people.push(material.person.clone());
+            }
+            one_more
+        });
+    }
     Ok(materials)
 }
 
@@ -186,10 +200,26 @@ fn recorded(motion: &Motion, seed: u64) -> Result<Vec<Material>, SubjectError> {
     };
     let sets = read(&motion.folders, motion.matching.as_deref())?;
     let others = read(&motion.off_model, None)?;
+    for notice in sets.iter().chain(&others).flat_map(|set| &set.notices) {
+        eprintln!("note: {notice}");
+    }
+    for (n, set) in sets.iter().enumerate() {
+        if sets[..n].iter().any(|other| other.name == set.name) {
+            return Err(SubjectError::Alike {
+                folder: motion.folders[n].display().to_string(),
+                name: set.name.clone(),
+            });
+        }
+    }
     let mut all = Vec::new();
     for (n, set) in sets.iter().enumerate() {
         let mut people: Vec<(&str, Vec<&Demonstration>)> = Vec::new();
-        for d in &set.demonstrations {
+        for (m, d) in set.demonstrations.iter().enumerate() {
+            // A copy would be learned from where the other is driven.
+            let before = &set.demonstrations[..m];
+            if before.iter().any(|other| other.sha256() == d.sha256()) {
+                continue;
+            }
             let who = motion.persons.person(d);
             match people.iter_mut().find(|(w, _)| *w == who) {
                 Some((_, of)) => of.push(d),
@@ -311,5 +341,45 @@ mod tests {
         }
         assert_eq!(every[3].on_model.sha256(), last[0].on_model.sha256());
         assert_eq!(every[3].learn[0].sha256(), last[0].learn[0].sha256());
+    }
+
+    #[test]
+    fn a_copy_of_what_is_driven_is_not_learned_from_and_folders_have_names_of_their_own() {
+        let dir = tempfile::tempdir().unwrap();
+        let place = |folder: &str, index: u32, name: &str| {
+            let folder = dir.path().join(folder);
+            std::fs::create_dir_all(&folder).unwrap();
+            let d = made("x", 7, index, false, false).unwrap();
+            std::fs::write(folder.join(name), d.to_csv()).unwrap();
+        };
+        for (index, name) in [
+            (0, "s1_0"),
+            (1, "s1_1"),
+            (2, "s1_2"),
+            (1, "s1_3"),
+            (3, "s2_0"),
+            (4, "s2_1"),
+        ] {
+            place("a/wave", index, &format!("{name}.csv"));
+            place("b/wave", index, &format!("{name}.csv"));
+        }
+        let plan = |motion: &str| {
+            let text = format!("[motion]\n{motion}\n");
+            Plan::parse("a", &text, dir.path()).unwrap()
+        };
+        let all = materials(&plan(
+            "folders = [\"a/wave\"]\nevery = true\ngroup_by = \"{}_*\"",
+        ))
+        .unwrap();
+        assert_eq!(all.len(), 5, "each once");
+        for m in &all {
+            assert!(m.learn.iter().all(|l| l.sha256() != m.on_model.sha256()));
+        }
+        let mut one = plan("folders = [\"a/wave\"]\nevery = true\ngroup_by = \"{}_*\"");
+        one.motion.most = Some(1);
+        let first = materials(&one).unwrap();
+        assert!(first.len() == 3 && first.iter().all(|m| m.person == "s1"));
+        let alike = materials(&plan("folders = [\"a/wave\", \"b/wave\"]"));
+        assert!(matches!(alike, Err(SubjectError::Alike { .. })));
     }
 }

@@ -261,3 +261,52 @@ fn whoever_follows_meets_the_same_link_at_the_same_moment_of_the_hand() {
     }
     assert_eq!(kinds.len(), 12);
 }
+
+/// A plan's files are those beside it, wherever it is run and reported from; a plan that somebody keeps where results go stays.
+#[test]
+fn a_recorded_link_is_the_plans_own_and_has_no_delay_of_its_own() {
+    let scratch = tempfile::tempdir().unwrap();
+    let at = |name: &str| scratch.path().join(name);
+    std::fs::create_dir(at("mine")).unwrap();
+    let (plan, out) = (at("mine").join("slow.toml"), at("out"));
+    let text = "[motion]\npeople = 1\nperformances = 2\n[factors]\nmotion = \"on-model\"\nmethod = [\"hold\", \"floor\"]\n\
+                link = [\"trace phone.csv\", \"delay 100ms\"]\n";
+    std::fs::write(&plan, text).unwrap();
+    let series = "t_s,delay_ms\n0,40\n1,60\n";
+    std::fs::write(at("mine").join("phone.csv"), series).unwrap();
+    run(&args(&plan, &out, "1/1", 2)).unwrap();
+    let (manifest, _, rows) = store::read(&out).unwrap();
+    let known: Vec<_> = manifest.inputs.iter().collect();
+    let (name, hash) = known[0];
+    assert_eq!((known.len(), name.as_str()), (1, "phone.csv"));
+    assert_eq!(*hash, plan::sha256(series));
+    assert!(!manifest.is_of_recordings());
+
+    report::write(&out, &at("report.html"), Some(scratch.path())).unwrap();
+    let html = std::fs::read_to_string(at("report.html")).unwrap();
+    assert!(html.contains("generated hands") && !html.contains("At 0 ms"));
+    let held: Vec<f64> = rows.iter().filter_map(|r| r.figures.rmse_m).collect();
+    assert_eq!(held.len(), 3);
+
+    std::fs::write(at("mine").join("phone.csv"), "t_s,delay_ms\n0,400\n").unwrap();
+    let refused = run(&args(&plan, &out, "1/1", 2)).unwrap_err().to_string();
+    assert!(refused.contains("state of the plan's files"), "{refused}");
+
+    let precious = at("mine").join(store::PLAN);
+    std::fs::write(&precious, "precious").unwrap();
+    let refused = run(&args(&plan, &at("mine"), "1/1", 2)).unwrap_err();
+    assert!(
+        refused.to_string().contains("is not this plan"),
+        "{refused}"
+    );
+    let refused = store::merge(&at("mine"), std::slice::from_ref(&out)).unwrap_err();
+    assert!(
+        refused.to_string().contains("is not this plan"),
+        "{refused}"
+    );
+    assert_eq!(std::fs::read_to_string(&precious).unwrap(), "precious");
+
+    std::fs::write(out.join(store::PLAN), text.replace("100ms", "10ms")).unwrap();
+    let edited = report::write(&out, &at("x.html"), None).unwrap_err();
+    assert!(edited.to_string().contains("is not the plan"), "{edited}");
+}

@@ -1,7 +1,7 @@
 //! The pictures of a report; one that the plan has nothing for is left out.
 
 use super::group::Group;
-use super::view::{Moment, View, called, colour, delay_s, rate_bit_s};
+use super::view::{Moment, View, called, colour, delay_s, one_way, rate_bit_s};
 use crate::experiment::row::Row;
 use crate::figure::{BLACK, Figure, GREY, Layer, Panel, Shape};
 use crate::measure::principal_axis;
@@ -301,7 +301,7 @@ fn lags(view: &View<'_>) -> Option<Chart> {
             "How many runs lag by no more than that, over {link}: the shift at which tip and hand agree best. Below zero the tip is early."
         ),
         panel: panel(
-            &format!("Lag, {:.0} ms one way", delay? * 1e3),
+            &format!("Lag, {}", one_way(delay)),
             "lag / ms",
             "share of the runs",
             layers,
@@ -327,7 +327,7 @@ fn ages(view: &View<'_>) -> Option<Chart> {
             "How old what the arm follows is, of one person's runs over {link}. Telemime speaks only when it has to, so its news is older, and yet its error smaller."
         ),
         panel: panel(
-            &format!("Age of information, {:.0} ms one way", delay? * 1e3),
+            &format!("Age of information, {}", one_way(delay)),
             "age / ms",
             "share of the time",
             layers,
@@ -473,7 +473,8 @@ fn horizons(view: &View<'_>) -> Option<Chart> {
     }
     Some(Chart {
         name: "horizon",
-        caption: "How far off predictions are, without network and arm: ours from each message, the others from each sample.".into(),
+        caption: "How far off predictions are, without network and arm: each from every sample."
+            .into(),
         panel: panel(
             "Prediction error by horizon",
             "ahead / ms",

@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use super::charts::Chart;
 use super::group::{Group, Interval};
 use super::outages::outages;
-use super::view::{View, called, delay_s, value};
+use super::view::{View, called, delay_s, one_way, value};
 use crate::cli::plural;
 use crate::experiment::factor::{FACTORS, UNUSED};
 use crate::experiment::real::Ground;
@@ -82,10 +82,10 @@ fn seeds(view: &View<'_>) -> usize {
 }
 
 fn summary(view: &View<'_>, manifest: &Manifest) -> String {
-    let driven = if manifest.inputs.is_empty() {
-        "generated hands"
-    } else {
+    let driven = if manifest.is_of_recordings() {
         "recorded hands"
+    } else {
+        "generated hands"
     };
     let ground = match manifest.ground {
         Ground::Virtual => {
@@ -125,12 +125,12 @@ fn tiles(view: &View<'_>) -> String {
         return String::new();
     };
     let motion = ours.text("motion");
-    let Some(link) = delay_s(ours) else {
-        return String::new();
+    let link = match delay_s(ours) {
+        Some(s) => format!("At {}", one_way(Some(s))),
+        None => format!("Over {}", one_way(None)),
     };
     let mut out = format!(
-        "<section>\n<h2>At {:.0} ms one way <small>({}; {motion})</small></h2>\n<div class=\"tiles\">\n",
-        link * 1e3,
+        "<section>\n<h2>{link} <small>({}; {motion})</small></h2>\n<div class=\"tiles\">\n",
         escape(ours.text("up"))
     );
     let mut tile = |found: Option<Interval>,

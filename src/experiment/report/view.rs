@@ -89,16 +89,15 @@ impl<'a> View<'a> {
     /// Whether links differ in delay, jitter and loss only: then an error may be drawn over the delay.
     pub(super) fn differ_by_delay(&self) -> bool {
         let rest = |g: &Group<'_>| {
-            let link = link(g.text("up"), Path::new(".")).ok()?;
             Some(LinkConfig {
                 delay_s: 0.0,
                 jitter_s: 0.0,
                 loss: LinkConfig::default().loss,
-                ..link
+                ..nominal(g)?
             })
         };
-        let all: Vec<_> = self.leading().into_iter().filter_map(rest).collect();
-        all.windows(2).all(|w| w[0] == w[1])
+        let all: Option<Vec<_>> = self.leading().into_iter().map(rest).collect();
+        all.is_some_and(|all| all.windows(2).all(|w| w[0] == w[1]))
     }
 
     /// Delays of those groups' links, s, ascending.
@@ -158,7 +157,7 @@ impl<'a> View<'a> {
         delay: Option<f64>,
         but: &[&str],
     ) -> bool {
-        let off = || delay.is_some() && delay_s(group).is_some_and(|s| Some(s) != delay);
+        let off = || delay.is_some() && group.text("up") != UNUSED && delay_s(group) != delay;
         group.text("motion") == motion && !off() && self.plain(group, but)
     }
 
@@ -178,18 +177,32 @@ impl<'a> View<'a> {
     }
 }
 
+/// A group's link as it is set; `None` where it is a recorded one, whose files need not be here, or concerns nobody.
+fn nominal(group: &Group<'_>) -> Option<LinkConfig> {
+    let text = group.text("up");
+    let recorded = |word: &str| word.len() >= 3 && "trace".starts_with(word);
+    if text == UNUSED || text.split_whitespace().any(recorded) {
+        return None;
+    }
+    link(text, Path::new("")).ok()
+}
+
 /// The delay a group's link is set to, s.
 pub(super) fn delay_s(group: &Group<'_>) -> Option<f64> {
-    match group.text("up") {
-        UNUSED => None,
-        text => Some(link(text, Path::new(".")).ok()?.delay_s),
-    }
+    Some(nominal(group)?.delay_s)
 }
 
 /// The rate a group's link is set to, bit/s.
 pub(super) fn rate_bit_s(group: &Group<'_>) -> Option<f64> {
-    let rate = link(group.text("up"), Path::new(".")).ok()?.rate?;
-    Some(rate.bit_s as f64)
+    Some(nominal(group)?.rate?.bit_s as f64)
+}
+
+/// What heads pictures of one delay.
+pub(super) fn one_way(delay_s: Option<f64>) -> String {
+    delay_s.map_or_else(
+        || "a recorded link".into(),
+        |s| format!("{:.0} ms one way", s * 1e3),
+    )
 }
 
 /// A method's colour, everywhere.
