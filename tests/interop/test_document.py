@@ -160,6 +160,8 @@ class Document(unittest.TestCase):
         self.assertIsNone(lease.until(10.0, 0.65, 1.2))
         self.assertEqual(lease.until(10.0, 0.65, 0.2, 11.0), 11.0)
         self.assertEqual(lease.until(10.0, 60.0, 0.0), 11.0)
+        self.assertAlmostEqual(lease.until(10.0, 65.0, 1.4), 10.1)
+        self.assertIsNone(lease.until(10.0, 65.0, 1.6))
         self.assertEqual(lease.exchange(90.0, 3.0, 3.0, 90.2)[1], 90.2 - 90.0)
         self.assertIsNone(lease.exchange(90.0, 3.0, 2.9, 90.2))
 

@@ -13,10 +13,10 @@ def exchange(t1, t2, t3, t4):
 
 def until(now, lease, age, deadline=None):
     """The deadline after a newer message with this lease and age (s); the old one if the message has nothing left to give."""
-    left = lease - max(0.0, age - ACCEPTED_DELAY)
+    left = min(lease, LONGEST) - max(0.0, age - ACCEPTED_DELAY)
     if left <= 0 or age < -ACCEPTED_DELAY:
         return deadline
-    new = now + min(left, LONGEST)
+    new = now + left
     return new if deadline is None else max(deadline, new)
 
 

@@ -125,6 +125,7 @@ def decode(state, data, grid, before=()):
         n = r.golomb(a) if known else 0
         if n == 0:
             gap = r.golomb(12)
+            require(gap < 1 << 31, "ticks", gap)
             at, last = (known[-1].x, known[-1].tick + gap + 1) if known else (origin, tick - gap)
             x = [e + r.signed(6) for e in at]
             knot = Knot(last, x, [2 * r.signed(4) for _ in at], True)

@@ -94,7 +94,7 @@ def unpack(data, dims):
 
 def check(plan):
     """Raises unless everything is in its range."""
-    require(plan["step_nm"] >= 1, "step_nm", plan["step_nm"])
+    require(1 <= plan["step_nm"] < 1 << 32, "step_nm", plan["step_nm"])
     require(1 <= plan["tick_us"] <= 1_000_000, "tick_us", plan["tick_us"])
     for tick, values in plan["points"]:
         require(tick < 1 << 32, "tick", tick)

@@ -83,6 +83,12 @@ pub(super) fn plans_and_skills(say: &mut impl FnMut(&'static str, &str, Vec<u8>,
         ],
         "Malformed",
     );
+    say(
+        "plan",
+        "a step of five metres",
+        vec![0x08, 0x8a, 0xb2, 0x89, 0xee, 0x51, 0x09, 0xfc, 0xbc, 0, 0],
+        "Malformed",
+    );
     let skill = example(1, 1).to_bytes().to_vec();
     say(
         "skill",
