@@ -28,7 +28,7 @@ pub(crate) struct Args {
     #[arg(long)]
     function: bool,
     /// Only the files whose names match this pattern (* stands for anything).
-    #[arg(long = "match", value_name = "PATTERN", requires = "dir")]
+    #[arg(long = "match", value_name = "PATTERN", conflicts_with = "function")]
     matching: Option<String>,
     /// Numbers of components to try.
     #[arg(long, value_name = "FROM..TO", default_value = "1..15", value_parser = range)]

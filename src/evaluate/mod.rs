@@ -145,6 +145,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         link: &link,
         arm: arm.as_ref(),
         seed: args.seed,
+        link_seed: args.link.link_seed,
     };
     let rounds = plan.rounds()?;
     let bar = ProgressBar::new(rounds.len() as u64);

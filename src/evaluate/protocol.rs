@@ -115,6 +115,8 @@ pub(super) struct Plan<'a> {
     /// The arm to drive, too.
     pub(super) arm: Option<&'a Drive>,
     pub(super) seed: u64,
+    /// From 1 on, which of the link's chances.
+    pub(super) link_seed: u64,
 }
 
 /// One moment of the guarded predictor, at the horizon nearest to 100 ms.
@@ -353,7 +355,8 @@ impl Plan<'_> {
         };
         let schemes = if off.is_none() { self.schemes } else { &[] };
         // The head of a hash: chances of their own for every recording.
-        let seed = self.seed ^ u64::from_le_bytes(*d.sha256().first_chunk().expect("32 bytes"));
+        let head = u64::from_le_bytes(*d.sha256().first_chunk().expect("32 bytes"));
+        let seed = self.seed ^ head ^ self.link_seed.wrapping_sub(1);
         let arm = self.arm.filter(|_| off.is_none());
         let driven = arm.map(|arm| arm::drive(d, skill, arm, seed)).transpose()?;
         Ok(Performance {
@@ -412,7 +415,10 @@ mod tests {
     fn set(name: &str, files: &[&str]) -> Demonstrations {
         let recording = |file: &&str| {
             // Every name another recording: what was learned is known by its content.
-            let offset = file.bytes().map(f64::from).sum::<f64>() * 1e-3 + name.len() as f64;
+            let number = file
+                .bytes()
+                .fold(0, |n, byte| (n * 7 + u32::from(byte)) % 4099);
+            let offset = f64::from(number) * 1e-3 + name.len() as f64;
             let at = |i: i32| Sample::at(f64::from(i) * 0.1, Vector3::repeat(offset));
             let samples: Vec<_> = (0..8).map(at).collect();
             Demonstration::from_samples(file, &samples).unwrap()
@@ -442,6 +448,7 @@ mod tests {
             link: &LinkConfig::default(),
             arm: None,
             seed: 0,
+            link_seed: 1,
         };
         plan.rounds()
     }
@@ -478,6 +485,15 @@ mod tests {
         let cross = rounds(&sets, &[], Protocol::Cross, 9).unwrap();
         assert_eq!(cross[0].test, [0, 1]);
         assert_eq!(cross[0].learn, [2, 3, 4]);
+    }
+
+    #[test]
+    fn a_copy_of_what_is_predicted_is_not_learned_from() {
+        let mut twice = set("a", &["a_s1_t1", "a_s1_t2", "a_s1_t3"]);
+        twice.demonstrations[1] = twice.demonstrations[0].clone();
+        let rounds = rounds(&[twice], &[], Protocol::LeaveOneOut, 9).unwrap();
+        let learned: Vec<_> = rounds.iter().map(|r| r.learn.clone()).collect();
+        assert_eq!(learned, [vec![2], vec![2], vec![0, 1]]);
     }
 
     #[test]

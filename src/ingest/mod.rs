@@ -125,6 +125,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         bail!("--at cuts one recording; import the others by themselves");
     }
     let depth = args.format == Some(Format::Depth);
+    if !depth && (args.mirror || args.camera.is_some()) {
+        bail!("--camera and --mirror are for --format depth; --axes turns other recordings");
+    }
+    if let Some(path) = &args.figure {
+        crate::figure::check(path)?;
+    }
     let raws = expanded(&args.raw, depth)?;
     let options = Options {
         format: args.format,
