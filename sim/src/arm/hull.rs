@@ -66,8 +66,10 @@ impl Hulls {
 
     /// All capsules of `arm`, base first: its shapes, less those inside another of the same body, and where a body has none, or a mesh, a derived one.
     pub(super) fn capsules(self, arm: &ArmModel) -> Vec<Capsule> {
-        let mut out: Vec<Capsule> = Vec::new();
-        for body in 0..=arm.dof() {
+        let mut bodies: Vec<Vec<Capsule>> = vec![Vec::new(); arm.dof() + 1];
+        let mut free = MAX_CAPSULES;
+        // The base last: what stands beside the arm must not take the places of its links.
+        for (i, body) in (1..=arm.dof()).chain([0]).enumerate() {
             let mut own: Vec<Capsule> = self
                 .shapes
                 .iter()
@@ -85,10 +87,11 @@ impl Hulls {
                 }
             }
             // Every later body has room for one.
-            kept.truncate(MAX_CAPSULES - out.len() - (arm.dof() - body));
-            out.extend(kept);
+            kept.truncate(free - (arm.dof() - i));
+            free -= kept.len();
+            bodies[body] = kept;
         }
-        out
+        bodies.concat()
     }
 }
 
@@ -127,7 +130,7 @@ fn radius(body: &Body, chain_m: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::arm::{LoadOptions, Notice};
+    use crate::arm::{ArmError, LoadOptions, Notice};
 
     fn load(collisions: &str) -> ArmModel {
         let urdf = format!(
@@ -190,5 +193,56 @@ mod tests {
             .map(|i| shape(r#"<sphere radius=".01"/>"#, &format!("{i} 0 0")))
             .collect();
         assert_eq!(load(&many).capsules().len(), MAX_CAPSULES);
+    }
+
+    /// An arm of one joint on a column, beside which stand `collisions` on a lift.
+    fn beside(collisions: &str, own: &str, options: &LoadOptions) -> Result<ArmModel, ArmError> {
+        let urdf = format!(
+            r#"<robot name="r"><link name="b"/><link name="table"><inertial><mass value="80"/><inertia ixx="9" ixy="0" ixz="0" iyy="9" iyz="0" izz="9"/></inertial>{collisions}</link>
+            <link name="l"><inertial><mass value="1"/><inertia ixx=".1" ixy="0" ixz="0" iyy=".1" iyz="0" izz=".1"/></inertial>{own}</link><link name="tcp"/>
+            <joint name="lift" type="prismatic"><parent link="b"/><child link="table"/><origin xyz="0 2 0"/><axis xyz="0 0 1"/><limit lower="0" upper="1" velocity="1" effort="1"/></joint>
+            <joint name="j" type="continuous"><parent link="b"/><child link="l"/><origin xyz="0 0 .5"/><axis xyz="0 0 1"/></joint>
+            <joint name="t" type="fixed"><parent link="l"/><child link="tcp"/><origin xyz="1 0 0"/></joint></robot>"#
+        );
+        let options = LoadOptions {
+            tip: Some("tcp".to_owned()),
+            ..options.clone()
+        };
+        ArmModel::from_urdf(&urdf, &options)
+    }
+
+    #[test]
+    fn what_stands_on_the_base_beside_the_arm_is_part_of_its_hull_where_it_is_fixed() {
+        let ball = shape(r#"<sphere radius=".1"/>"#, "0 0 .2");
+        for height_m in [0.0, 0.7] {
+            let mut options = LoadOptions::default();
+            options.fixed.insert("lift".to_owned(), height_m);
+            let arm = beside(&ball, "", &options).unwrap();
+            let table = arm.capsules().iter().find(|c| c.link == "table").unwrap();
+            assert_eq!(table.body, 0);
+            assert!((table.a - Vector3::new(0.0, 2.0, 0.2 + height_m)).norm() < 1e-12);
+            assert!(arm.notices().contains(&Notice::JointFixed {
+                joint: "lift".into(),
+                value: height_m
+            }));
+            assert_eq!(arm.moving_mass_kg(), 1.0, "the base does not move");
+        }
+        let mut options = LoadOptions::default();
+        options.fixed.insert("lift".to_owned(), 1.2);
+        let outside = beside(&ball, "", &options);
+        assert!(matches!(outside, Err(ArmError::FixedOutside { .. })));
+    }
+
+    #[test]
+    fn what_stands_beside_the_arm_takes_no_place_of_its_links() {
+        let balls = |n: i32, radius: &str| -> String {
+            let ball = format!(r#"<sphere radius="{radius}"/>"#);
+            (0..n).map(|i| shape(&ball, &format!("{i} 0 0"))).collect()
+        };
+        let (table, own) = (balls(40, ".2"), balls(5, ".1"));
+        let arm = beside(&table, &own, &LoadOptions::default()).unwrap();
+        let of = |body| arm.capsules().iter().filter(|c| c.body == body).count();
+        assert_eq!((of(0), of(1)), (MAX_CAPSULES - 5, 5));
+        assert!(arm.capsules().is_sorted_by_key(|c| c.body), "base first");
     }
 }
