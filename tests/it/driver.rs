@@ -232,12 +232,13 @@ fn settings_that_cannot_be_with_the_arm_are_told_as_such() {
     let stage = Stage::new();
     let urdf = telemime_sim::arm::default_urdf().replace(r#"effort="12""#, r#"effort="0""#);
     std::fs::write(stage.path("loose.urdf"), urdf).unwrap();
-    let (key, urdf) = (stage.text("robot.key"), stage.text("loose.urdf"));
+    std::fs::write(stage.path("empty.toml"), "").unwrap();
+    let [key, urdf, file] = ["robot.key", "loose.urdf", "empty.toml"].map(|name| stage.text(name));
     for (flags, words) in [
         (["--bandwidth", "1.2"], "1.50 rad/s is the least"),
         (["--stiffness", "100"], "joint `joint5` states none"),
     ] {
-        for first in [&["robot"][..], &["check-config", "robot", "--"]] {
+        for first in [&["robot"][..], &["check-config", "robot", &file, "--"]] {
             let arm = ["--identity", &key, "--urdf", &urdf];
             let (status, said) = Process::start(&[first, &arm, &flags].concat()).end();
             assert_eq!(status.code(), Some(2), "{first:?}: {said}");

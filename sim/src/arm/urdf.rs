@@ -238,20 +238,19 @@ impl<'a> Reader<'a> {
         pose: Isometry3<f64>,
         next: Option<&&urdf_rs::Joint>,
     ) -> Result<Vec<(&'a str, Isometry3<f64>)>, ArmError> {
-        let mut placed = Vec::new();
-        let mut open = vec![(link, pose)];
-        while let Some((link, pose)) = open.pop() {
+        self.shapes(link, &pose)?;
+        let mut placed = vec![(link, pose)];
+        let off_chain = |j: &&urdf_rs::Joint| next.is_none_or(|n| n.name != j.name);
+        let branches = self.tree.children(link).iter().copied().filter(off_chain);
+        let mut open: Vec<_> = branches.map(|joint| (joint, pose)).collect();
+        while let Some((joint, pose)) = open.pop() {
+            let pose = pose
+                * isometry(&joint.origin, "origin", &joint.name)?
+                * self.fixed_motion(joint)?;
+            let link = &joint.child.link;
             self.shapes(link, &pose)?;
             placed.push((link, pose));
-            let branches = self.tree.children(link).to_vec();
-            for joint in branches {
-                if next.is_some_and(|next| next.name == joint.name) {
-                    continue;
-                }
-                let origin = isometry(&joint.origin, "origin", &joint.name)?;
-                let pose = pose * origin * self.fixed_motion(joint)?;
-                open.push((&joint.child.link, pose));
-            }
+            open.extend(self.tree.children(link).iter().map(|j| (*j, pose)));
         }
         Ok(placed)
     }
