@@ -107,7 +107,12 @@ pub(super) fn read(text: &str, options: &LoadOptions) -> Result<ArmModel, ArmErr
         last.body = last.body.joined(&payload.body().moved(&pose));
     }
     let turns = joints.iter().map(turns).collect();
-    let Reader { hulls, notices, .. } = reader;
+    let Reader {
+        hulls,
+        notices,
+        tree: Tree { root, .. },
+        ..
+    } = reader;
     let mut arm = ArmModel {
         name: robot.name.clone(),
         tip: tip.to_owned(),
@@ -117,7 +122,8 @@ pub(super) fn read(text: &str, options: &LoadOptions) -> Result<ArmModel, ArmErr
         capsules: Vec::new(),
         turns,
     };
-    arm.capsules = hulls.capsules(&arm);
+    let chain: Vec<_> = path.iter().map(|j| j.child.link.as_str()).collect();
+    arm.capsules = hulls.capsules(&arm, &[&[root], &chain[..]].concat());
     refuse_massless(&arm)?;
     Ok(arm)
 }
