@@ -9,7 +9,7 @@ use clap::Subcommand;
 use serde::Serialize;
 use telemime_robot::cli::parse_fixed;
 use telemime_robot::control::{
-    ControlConfig, ControlError, Controller, home_posture, workspace_radius,
+    CloseAtStart, ControlConfig, ControlError, Controller, home_posture, workspace_radius,
 };
 use telemime_sim::arm::{
     ArmModel, CapsuleSource, Joint, JointKind, Joints, LoadOptions, Notice, Payload, Unguarded,
@@ -181,15 +181,8 @@ fn look(arm: ArmModel, given: Option<Joints>, payload: Option<Payload>) -> Repor
             _ => warnings.push(notice.to_string()),
         }
     }
-    for (pair, why) in hulls.unguarded() {
-        if let Unguarded::AtStart { distance_m } = why {
-            let [a, b] = links(*pair);
-            warnings.push(format!(
-                "the hulls of `{a}` and `{b}` are {:.0} mm apart at the start already: not guarded",
-                distance_m * 1e3
-            ));
-        }
-    }
+    let close = CloseAtStart::among(&arm, &hulls);
+    warnings.extend(close.iter().map(ToString::to_string));
     let drive = drive(&arm, &config, &start);
     Report {
         name: arm.name().to_owned(),

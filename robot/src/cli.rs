@@ -10,7 +10,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow};
 use telemime_endpoint::admin;
 use telemime_endpoint::cli::{self, Printer};
 use telemime_endpoint::config::{self, Settings};
@@ -243,12 +243,15 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
         // Before the posture is looked at: it is one of the driver's joints.
         bridge.fits(&Rig::arm(&urdf, &text, &options)?)?;
     }
-    let rig = Rig::read(urdf, &text, &options)?;
+    let rig = Rig::read(urdf, &text, &options).map_err(settings::unusable)?;
     // Of our own arm there is nothing to tell.
     if options.urdf.is_some() {
         for notice in rig.arm.notices() {
             logs::note(&notice.to_string());
         }
+    }
+    for pair in rig.close_at_start() {
+        logs::note(&pair.to_string());
     }
     let recorder = record::ticks(args.record.as_deref(), &rig)?;
     let listen = match args.listen {
@@ -403,12 +406,22 @@ async fn serve(args: &Args) -> anyhow::Result<()> {
     log.servo(&timing.read());
     drop(log);
     printing.finish();
-    if let Some(recorder) = recorder {
-        recorder.finish()?;
-    }
-    match (served, words.and_then(|words| words.get())) {
-        (Err(failure @ Failure::Arm(_)), Some(words)) => bail!("{failure}: {words}"),
-        (served, _) => Ok(served?),
+    let recorded = recorder.map_or(Ok(()), TickRecorder::finish);
+    let served = match (served, words.and_then(|words| words.get())) {
+        (Err(failure @ Failure::Arm(_)), Some(words)) => Err(anyhow!("{failure}: {words}")),
+        (served, _) => served.map_err(anyhow::Error::from),
+    };
+    outcome(served, recorded)
+}
+
+/// Why the robot ended comes before what was not recorded of it, which is noted then.
+fn outcome(served: anyhow::Result<()>, recorded: anyhow::Result<()>) -> anyhow::Result<()> {
+    match (served, recorded) {
+        (Err(failure), Err(unrecorded)) => {
+            logs::note(&format!("{unrecorded:#}"));
+            Err(failure)
+        }
+        (served, recorded) => served.and(recorded),
     }
 }
 
@@ -540,4 +553,24 @@ async fn listen_to(
         }
     }
     recorder
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_stopped_the_robot_is_told_before_what_was_not_recorded() {
+        let failed = || Err(anyhow!("the arm was stopped"));
+        let unrecorded = || Err(anyhow!("cannot write ticks.csv"));
+        for (served, recorded, told) in [
+            (Ok(()), Ok(()), None),
+            (Ok(()), unrecorded(), Some("cannot write ticks.csv")),
+            (failed(), Ok(()), Some("the arm was stopped")),
+            (failed(), unrecorded(), Some("the arm was stopped")),
+        ] {
+            let error = outcome(served, recorded).err().map(|e| e.to_string());
+            assert_eq!(error.as_deref(), told);
+        }
+    }
 }

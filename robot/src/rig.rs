@@ -13,7 +13,9 @@ use telemime_sim::arm::{
     default_urdf,
 };
 
-use crate::control::{ControlConfig, ControlError, Controller, home_posture, workspace_radius};
+use crate::control::{
+    CloseAtStart, ControlConfig, ControlError, Controller, home_posture, workspace_radius,
+};
 use crate::safety::SafetyConfig;
 use crate::servo::{
     Core, CoreConfig, Manipulator, Rings, SimulatedArm, Station, Trajectory, Workspace,
@@ -254,6 +256,11 @@ impl Rig {
         (self.controller.clone(), self.plant.clone())
     }
 
+    /// The links that are not kept apart from each other because they begin too near: somebody should be told.
+    pub fn close_at_start(&self) -> Vec<CloseAtStart> {
+        self.controller.close_at_start()
+    }
+
     /// The servo's period, s.
     pub fn tick_s(&self) -> f64 {
         self.config.tick_s
@@ -321,6 +328,29 @@ mod tests {
             matches!(error, RigError::NoRoom { radius_m, .. } if radius_m < LEAST_RADIUS_M),
             "{error}"
         );
+    }
+
+    #[test]
+    fn what_begins_too_near_itself_is_named_and_what_keeps_nothing_apart_names_nothing() {
+        assert_eq!(
+            Rig::load(&RigOptions::default()).unwrap().close_at_start(),
+            []
+        );
+        // Folded onto itself, within every joint's range.
+        let mut folded = RigOptions {
+            start: Some(vec![0.4, 0.5, 0.2, -2.85, 0.3, 0.6, 0.0]),
+            ..RigOptions::default()
+        };
+        let close = Rig::load(&folded).unwrap().close_at_start();
+        let told: Vec<_> = close.iter().map(ToString::to_string).collect();
+        println!("{told:#?}");
+        assert!(!close.is_empty());
+        for (pair, told) in close.iter().zip(&told) {
+            assert!(pair.distance_m < 0.03);
+            assert!(pair.links.iter().all(|link| told.contains(link.as_str())));
+        }
+        folded.control.barrier.self_collision = false;
+        assert_eq!(Rig::load(&folded).unwrap().close_at_start(), []);
     }
 
     /// As the document says it is to be read.

@@ -124,9 +124,13 @@ impl Safety {
     }
 
     /// Emergency stop, from any state, latched.
-    /// A stop at the robot takes over from one of the operator's: it asks for more. The arm's own stays what it is.
+    /// A stop at the robot takes over from one of the operator's: it asks for more. The arm's own takes over from either, and nothing from it.
     pub fn stop(&mut self, cause: Cause) {
-        let takes_over = cause == Cause::LocalStop && self.cause == Cause::OperatorStop;
+        let takes_over = match cause {
+            Cause::ArmFault => self.cause != Cause::ArmFault,
+            Cause::LocalStop => self.cause == Cause::OperatorStop,
+            _ => false,
+        };
         if self.state != RobotState::Stopped || takes_over {
             self.enter(RobotState::Stopped, cause);
         }
@@ -266,6 +270,33 @@ mod tests {
         );
         safety.reset(true, None);
         assert_eq!(safety.state(), RobotState::Ready);
+    }
+
+    #[test]
+    fn the_arms_own_stop_takes_over_from_every_other_and_none_from_it() {
+        use Cause::{ArmFault, LocalStop, OperatorStop};
+        for (first, then, stays) in [
+            (OperatorStop, LocalStop, LocalStop),
+            (OperatorStop, ArmFault, ArmFault),
+            (LocalStop, ArmFault, ArmFault),
+            (LocalStop, OperatorStop, LocalStop),
+            (ArmFault, LocalStop, ArmFault),
+            (ArmFault, OperatorStop, ArmFault),
+        ] {
+            let mut safety = engaged();
+            safety.stop(first);
+            let before = safety.transitions();
+            for _ in 0..3 {
+                safety.stop(then);
+            }
+            assert_eq!(
+                (safety.state(), safety.cause()),
+                (RobotState::Stopped, stays),
+                "{first:?}, then {then:?}"
+            );
+            let told = safety.transitions() - before;
+            assert_eq!(told, u32::from(stays != first), "told once, or not at all");
+        }
     }
 
     #[test]

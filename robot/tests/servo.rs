@@ -4,7 +4,7 @@
     reason = "clippy.toml allows it in tests, but does not know these helpers for tests"
 )]
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 use telemime_endpoint::Mono;
@@ -13,10 +13,13 @@ use telemime_protocol::predict::{Bend, Forecast, HandState, Held, Params};
 use telemime_protocol::spline::{BSpline, End};
 use telemime_protocol::time::Stamp;
 use telemime_protocol::wire::v1::{Cause, RobotState};
+use telemime_robot::control::joint_accelerations;
 use telemime_robot::rig::{Rig, RigOptions};
 use telemime_robot::servo::{
-    Bent, Engagement, Handle, Lease, Order, Report, Source, Station, Ticket, Trajectory, rings,
+    ArmFault, ArmState, Bent, Engagement, Handle, Lease, Manipulator, Order, Report, Setpoint,
+    Source, Station, Ticket, Trajectory, rings,
 };
+use telemime_sim::arm::{Joints, PlantReport};
 
 const MS: i64 = 1_000_000;
 
@@ -400,4 +403,107 @@ fn an_arm_that_has_yet_to_obey_is_not_at_rest_and_not_engaged() {
     let (_, q) = rested.unwrap();
     let end = bench.tick_at(from + 700);
     assert!((end.q - q).amax() < 1e-4, "what is said to rest rests");
+}
+
+/// An arm that is where it was told to be, and keeps what it was told; its driver measures no speed, or has not yet.
+struct Told {
+    q: Joints,
+    told: Arc<Mutex<Vec<Joints>>>,
+}
+
+impl Told {
+    fn state(&self) -> ArmState {
+        ArmState {
+            q: self.q,
+            ..ArmState::default()
+        }
+    }
+}
+
+impl Manipulator for Told {
+    fn sense(&mut self, _now: Mono) -> (ArmState, Option<ArmFault>) {
+        (self.state(), None)
+    }
+
+    fn act(&mut self, _now: Mono, setpoint: &Setpoint, _dt_s: f64) -> (PlantReport, ArmState) {
+        self.q = setpoint.reference.q;
+        self.told.lock().unwrap().push(setpoint.reference.qd);
+        (PlantReport::default(), self.state())
+    }
+}
+
+#[test]
+fn setpoints_that_move_are_not_engaged_whatever_a_driver_measures() {
+    let rig = Rig::load(&RigOptions {
+        driver: true,
+        ..RigOptions::default()
+    })
+    .unwrap();
+    let most = joint_accelerations(&rig.arm, &rig.home).unwrap();
+    let told = Arc::new(Mutex::new(Vec::new()));
+    let arm = Told {
+        q: rig.home,
+        told: told.clone(),
+    };
+    let (rings, handle) = rings();
+    let mut bench = Bench {
+        core: rig.servo_before(Box::new(arm), None, rings),
+        handle,
+        now_ms: 0,
+    };
+    bench.order(Order::Operator(true));
+    let (mut number, mut declined) = (0, 0);
+    for (wait_ms, side) in [
+        (1, 1.0),
+        (2, -1.0),
+        (5, 1.0),
+        (10, -1.0),
+        (20, 1.0),
+        (50, -1.0),
+    ] {
+        // A quick way aside, and rest there: what does not move the tip still returns to the start posture.
+        number += 1;
+        let aside = HAND_M + Vector3::new(0.0, 1.2 * side, 0.6);
+        let aside = HandState::first(Stamp::ZERO, aside);
+        bench.engage(number, 0.2);
+        for ms in 0..900 {
+            bench.tick_at(bench.now_ms + 1);
+            if ms % 50 == 0 {
+                let (lease, valid_at) = (bench.lease(), Mono(bench.now_ms * MS));
+                bench.order(Order::Track {
+                    ticket: ticket(number),
+                    forecast: Forecast::constant_velocity(&aside, &Params::DEFAULT),
+                    valid_at,
+                    turn: None,
+                    grip: None,
+                    lease,
+                });
+            }
+        }
+        // Let go, and pressed again.
+        bench.order(Order::Release(ticket(number)));
+        for _ in 0..wait_ms {
+            bench.tick_at(bench.now_ms + 1);
+        }
+        number += 1;
+        bench.engage(number, 0.2);
+        declined += u32::from(bench.tick_at(bench.now_ms + 1).declined == ticket(number));
+        bench.order(Order::Release(ticket(number)));
+        let mut last = None;
+        for _ in 0..500 {
+            last = Some(bench.tick_at(bench.now_ms + 1));
+        }
+        assert!(!last.unwrap().moving, "it comes to rest");
+    }
+    let told = told.lock().unwrap();
+    let mut worst = 0.0_f64;
+    for pair in told.windows(2) {
+        let change = (pair[1] - pair[0]) / 1e-3;
+        worst = worst.max(change.component_div(&most).fold(0.0, |a: f64, b| {
+            if b.is_finite() { a.max(b.abs()) } else { a }
+        }));
+    }
+    println!("{worst:.3} of the largest acceleration; {declined} declined");
+    assert!(worst < 1.001, "{worst}");
+    assert!(declined > 0);
 }

@@ -180,6 +180,73 @@ fn an_operator_hears_that_the_arm_failed() {
     assert_eq!(robot.end().0.code(), Some(1));
 }
 
+/// Somebody stops the arm, and cuts its power then.
+#[test]
+fn a_driver_that_fails_behind_a_stopped_arm_is_told_like_any_other() {
+    let _alone = alone();
+    let Some(driver) = command("docs/driver_example.py", "") else {
+        return;
+    };
+    let (stage, boxes) = (Stage::new(), tempfile::tempdir().unwrap());
+    let pid = stage.text("pid");
+    let driver = format!("echo $$ > {pid}; {driver}");
+    let folder = boxes.path().to_str().unwrap();
+    let (robot, _) = stage.robot_with(&flags(&driver, folder));
+    robot.event("driver");
+    robot.signal(Signal::USR1);
+    let stopped = robot.event_where("state", |e| e["state"] == "Stopped");
+    assert_eq!(stopped["cause"], "LocalStop", "{stopped}");
+    let number = std::fs::read_to_string(&pid).unwrap();
+    let process = rustix::process::Pid::from_raw(number.trim().parse().unwrap()).unwrap();
+    rustix::process::kill_process(process, Signal::KILL).unwrap();
+    robot.event_where("state", |e| e["cause"] == "ArmFault");
+    robot.event_where("black_box", |e| e["why"] == "stop ArmFault");
+    let (status, said) = robot.end();
+    assert_eq!(status.code(), Some(1), "{said}");
+    assert!(said.contains("the driver has ended"), "{said}");
+}
+
+#[test]
+fn a_robot_that_starts_too_near_itself_names_what_it_does_not_keep_apart() {
+    let _alone = alone();
+    let stage = Stage::new();
+    for (start, says) in [
+        ("0.4,0.5,0.2,-2.85,0.3,0.6,0", true),
+        ("0,0.2,0,-1.6,0,1.4,0", false),
+    ] {
+        let (robot, _) = stage.robot_with(&["--start", start]);
+        robot.signal(Signal::TERM);
+        let (status, said) = robot.end();
+        assert!(status.success(), "{said}");
+        assert_eq!(
+            said.contains("at the start already: not guarded"),
+            says,
+            "{said}"
+        );
+    }
+}
+
+#[test]
+fn settings_that_cannot_be_with_the_arm_are_told_as_such() {
+    let _alone = alone();
+    let stage = Stage::new();
+    let urdf = telemime_sim::arm::default_urdf().replace(r#"effort="12""#, r#"effort="0""#);
+    std::fs::write(stage.path("loose.urdf"), urdf).unwrap();
+    std::fs::write(stage.path("empty.toml"), "").unwrap();
+    let [key, urdf, file] = ["robot.key", "loose.urdf", "empty.toml"].map(|name| stage.text(name));
+    for (flags, words) in [
+        (["--bandwidth", "1.2"], "1.50 rad/s is the least"),
+        (["--stiffness", "100"], "joint `joint5` states none"),
+    ] {
+        for first in [&["robot"][..], &["check-config", "robot", &file, "--"]] {
+            let arm = ["--identity", &key, "--urdf", &urdf];
+            let (status, said) = Process::start(&[first, &arm, &flags].concat()).end();
+            assert_eq!(status.code(), Some(2), "{first:?}: {said}");
+            assert!(said.contains(words), "{first:?}: {said}");
+        }
+    }
+}
+
 #[test]
 fn a_driver_that_is_none_is_one_clear_line() {
     let _alone = alone();

@@ -4,7 +4,7 @@ use telemime_endpoint::meter::Counts;
 use telemime_endpoint::metrics::Page;
 use telemime_endpoint::tally::{CAUSES, STATES, Tally, is_stop};
 use telemime_protocol::time::Stamp;
-use telemime_protocol::wire::v1::RobotState;
+use telemime_protocol::wire::v1::{Cause, RobotState};
 
 use super::Daemon;
 use crate::session::{Counters, Event, Seen, Session};
@@ -47,7 +47,7 @@ pub struct Snapshot {
     engagements: u64,
     state: Option<RobotState>,
     /// What the stream said last.
-    told: Option<RobotState>,
+    told: Option<(RobotState, Cause)>,
     /// By the order of [`CAUSES`].
     stops: [u64; CAUSES.len()],
     past: Sums,
@@ -81,7 +81,8 @@ impl Daemon {
                 Event::State(state, cause) => {
                     snapshot.state = Some(*state);
                     // Telemetry may be ahead of the stream, and tells of no cause.
-                    let stops = is_stop(snapshot.told.replace(*state), *state);
+                    let now = (*state, *cause);
+                    let stops = is_stop(snapshot.told.replace(now), now);
                     let which = CAUSES.iter().position(|(known, _)| known == cause);
                     if let Some(i) = which.filter(|_| stops) {
                         snapshot.stops[i] += 1;

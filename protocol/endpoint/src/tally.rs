@@ -91,12 +91,12 @@ pub const CAUSES: [(Cause, &str); 11] = [
     (Cause::ArmFault, "arm_fault"),
 ];
 
-/// Whether an arm that was in `before` and is in `now` has been stopped: it followed and does so no longer, or the
-/// emergency stop was pulled.
-pub fn is_stop(before: Option<RobotState>, now: RobotState) -> bool {
+/// Whether an arm that was in `before` and is in `now`, each with its cause, has been stopped: it followed and does so
+/// no longer, or the emergency stop was pulled; one that takes over from another is one more.
+pub fn is_stop(before: Option<(RobotState, Cause)>, now: (RobotState, Cause)) -> bool {
     let follows = |state| matches!(state, RobotState::Engaged | RobotState::Coasting);
-    let stopped = now == RobotState::Stopped && before != Some(now);
-    stopped || (before.is_some_and(follows) && !follows(now))
+    let stopped = now.0 == RobotState::Stopped && before != Some(now);
+    stopped || (before.is_some_and(|(state, _)| follows(state)) && !follows(now.0))
 }
 
 fn refusal(reason: Refusal) -> &'static str {
@@ -263,6 +263,8 @@ mod tests {
     #[test]
     fn a_stop_is_the_end_of_following_or_the_emergency_stop() {
         use RobotState::{Coasting, Engaged, Holding, Idle, Ready, Stopped};
+        let stops =
+            |before, now| is_stop(Some((before, Cause::Requested)), (now, Cause::Requested));
         for (before, now) in [
             (Engaged, Ready),
             (Engaged, Holding),
@@ -270,7 +272,7 @@ mod tests {
             (Engaged, Stopped),
             (Idle, Stopped),
         ] {
-            assert!(is_stop(Some(before), now), "{before:?} {now:?}");
+            assert!(stops(before, now), "{before:?} {now:?}");
         }
         for (before, now) in [
             (Engaged, Coasting),
@@ -280,9 +282,11 @@ mod tests {
             (Stopped, Stopped),
             (Stopped, Ready),
         ] {
-            assert!(!is_stop(Some(before), now), "{before:?} {now:?}");
+            assert!(!stops(before, now), "{before:?} {now:?}");
         }
-        assert!(!is_stop(None, Idle));
+        assert!(!is_stop(None, (Idle, Cause::Requested)));
+        let [local, arm] = [Cause::LocalStop, Cause::ArmFault].map(|cause| (Stopped, cause));
+        assert!(is_stop(Some(local), arm), "one that takes over");
     }
 
     #[test]

@@ -50,6 +50,11 @@ impl Ration {
         self.written += 1;
         Some(Share::Write(due))
     }
+
+    /// So many that were to be written could not be.
+    pub(super) fn give_back(&mut self, unwritten: u32) {
+        self.written = self.written.saturating_sub(unwritten);
+    }
 }
 
 #[cfg(test)]
@@ -80,6 +85,25 @@ mod tests {
         ration.note(fault);
         assert_eq!(ration.take(at(36_000), true), Some(Share::Write(fault)));
         assert_eq!(ration.take(at(36_001), true), None);
+    }
+
+    #[test]
+    fn what_could_not_be_written_uses_up_nothing() {
+        let mut ration = Ration::default();
+        let (stop, mut s) = (Due::Stop(Cause::OperatorStop), 0);
+        let mut take = |ration: &mut Ration| {
+            s += 10;
+            ration.note(stop);
+            ration.take(Mono(s * 1_000_000_000), false)
+        };
+        for _ in 0..2 * MOST {
+            assert_eq!(take(&mut ration), Some(Share::Write(stop)));
+            ration.give_back(1);
+        }
+        for _ in 0..MOST {
+            assert_eq!(take(&mut ration), Some(Share::Write(stop)));
+        }
+        assert_eq!(take(&mut ration), Some(Share::Enough(stop)));
     }
 
     #[test]

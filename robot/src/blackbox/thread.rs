@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
@@ -66,11 +66,13 @@ impl Keeper {
         );
         let (records, to_write) = sync_channel(1);
         let busy = Arc::new(AtomicBool::new(false));
+        let unwritten = Arc::new(AtomicU32::new(0));
         let writing = {
             let (dir, busy, say) = (dir.to_owned(), busy.clone(), say.clone());
+            let unwritten = unwritten.clone();
             std::thread::Builder::new()
                 .name("blackbox-out".into())
-                .spawn(move || write_all(&to_write, &dir, &busy, say))?
+                .spawn(move || write_all(&to_write, &dir, (&busy, &unwritten), say))?
         };
         let mut keeping = Keeping {
             recorder,
@@ -79,6 +81,7 @@ impl Keeper {
             asked: asked.clone(),
             records,
             busy,
+            unwritten,
             missing: (0, None),
         };
         let stop = quit.clone();
@@ -126,6 +129,8 @@ struct Keeping {
     asked: Arc<AtomicBool>,
     records: SyncSender<(Due, Draft)>,
     busy: Arc<AtomicBool>,
+    /// Stops whose record could not be written, since somebody looked.
+    unwritten: Arc<AtomicU32>,
     /// Ticks that nobody was told of, and when somebody was.
     missing: (u64, Option<Mono>),
 }
@@ -148,6 +153,8 @@ impl Keeping {
         if self.busy.load(Ordering::Acquire) && !last {
             return;
         }
+        self.ration
+            .give_back(self.unwritten.swap(0, Ordering::Acquire));
         let due = match self.ration.take(now, last) {
             Some(Share::Write(due)) => Some(due),
             Some(Share::Enough(due)) => {
@@ -173,10 +180,18 @@ impl Keeping {
     }
 }
 
-fn write_all(records: &Receiver<(Due, Draft)>, dir: &Path, busy: &AtomicBool, say: impl Fn(News)) {
+fn write_all(
+    records: &Receiver<(Due, Draft)>,
+    dir: &Path,
+    (busy, unwritten): (&AtomicBool, &AtomicU32),
+    say: impl Fn(News),
+) {
     let mut full = false;
     for (due, draft) in records {
         let saved = write(dir, due, &draft.sealed());
+        if saved.is_err() && matches!(due, Due::Stop(_)) {
+            unwritten.fetch_add(1, Ordering::Release);
+        }
         let was_full = full;
         full = matches!(saved, Err(WriteError::Full { .. }));
         if !(full && was_full) {

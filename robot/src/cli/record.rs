@@ -69,6 +69,8 @@ pub(super) struct TickRecorder {
     queue: SyncSender<Report>,
     thread: std::thread::JoinHandle<std::io::Result<()>>,
     lost: u64,
+    /// The thread has ended, and somebody was told.
+    ended: bool,
 }
 
 impl TickRecorder {
@@ -82,6 +84,10 @@ impl TickRecorder {
                 fresh.display()
             ));
         }
+        Self::on(fresh, file, dof)
+    }
+
+    fn on(path: PathBuf, file: File, dof: usize) -> anyhow::Result<Self> {
         let (queue, reports) = sync_channel::<Report>(QUEUE);
         let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
             let mut out = std::io::BufWriter::new(file);
@@ -99,16 +105,26 @@ impl TickRecorder {
             out.flush()
         })?;
         Ok(Self {
-            path: fresh,
+            path,
             queue,
             thread,
             lost: 0,
+            ended: false,
         })
     }
 
     pub(super) fn take(&mut self, report: &Report) {
-        if let Err(TrySendError::Full(_)) = self.queue.try_send(*report) {
-            self.lost += 1;
+        match self.queue.try_send(*report) {
+            Ok(()) => {}
+            Err(TrySendError::Full(_)) => self.lost += 1,
+            Err(TrySendError::Disconnected(_)) => {
+                if !std::mem::replace(&mut self.ended, true) {
+                    telemime_endpoint::logs::note(&format!(
+                        "{} cannot be written any more, and no tick from now on is in it; the reason follows when the robot ends",
+                        self.path.display()
+                    ));
+                }
+            }
         }
     }
 
@@ -118,6 +134,7 @@ impl TickRecorder {
             queue,
             thread,
             lost,
+            ended: _,
         } = self;
         drop(queue);
         match thread.join() {
@@ -137,6 +154,25 @@ impl TickRecorder {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_disk_that_is_full_is_noticed_when_it_is_and_told_at_the_end() {
+        let full = File::options().write(true).open("/dev/full").unwrap();
+        let mut recorder = TickRecorder::on("ticks.csv".into(), full, 7).unwrap();
+        let rig = Rig::load(&crate::rig::RigOptions::default()).unwrap();
+        let (rings, _handle) = crate::servo::rings();
+        let report = rig.servo(rings).tick(telemime_endpoint::Mono(0));
+        // Until its thread has found out.
+        while !recorder.ended {
+            recorder.take(&report);
+            std::thread::yield_now();
+        }
+        let lost = recorder.lost;
+        recorder.take(&report);
+        assert_eq!(recorder.lost, lost, "not for being slow");
+        let told = format!("{:#}", recorder.finish().unwrap_err());
+        assert!(told.contains("cannot write ticks.csv"), "{told}");
+    }
 
     #[test]
     fn an_earlier_recording_is_not_written_over() {

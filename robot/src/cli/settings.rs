@@ -8,14 +8,14 @@ use anyhow::{Context, ensure};
 use nalgebra::Vector3;
 use serde::Deserialize;
 use telemime_endpoint::Fingerprint;
-use telemime_endpoint::config::{Kind, Setting, Settings, Sheet};
+use telemime_endpoint::config::{Kind, Setting, Settings, Sheet, Unusable};
 use telemime_endpoint::{admin, cli, logs, recording};
 use telemime_sim::arm::{DeadTime, LoadOptions};
 
 use super::{Args, surroundings};
-use crate::control::{BarrierConfig, ControlConfig, FilterConfig, LimitedFilter};
+use crate::control::{BarrierConfig, ControlConfig, ControlError, FilterConfig, LimitedFilter};
 use crate::driver::{DriverConfig, FASTEST_HZ, PATIENCE_S, PatienceError};
-use crate::rig::{Rig, RigOptions};
+use crate::rig::{Rig, RigError, RigOptions};
 use crate::servo::Priority;
 
 /// Where operators are listened for unless said otherwise.
@@ -118,14 +118,14 @@ impl Settings for Args {
                     "stop_distance_m",
                     Kind::Number,
                     "0.02",
-                    "Links and planes are kept this far apart, m …",
+                    "Links are kept this far apart, m …",
                 )
                 .or(barrier.stop_m),
                 Setting::without_flag(
                     "slow_distance_m",
                     Kind::Number,
                     "0.1",
-                    "… and approached slower from this much farther on, m.",
+                    "… and approached slower from this much farther on, m; planes likewise, from this distance on.",
                 )
                 .or(barrier.slow_m),
                 new(
@@ -217,6 +217,14 @@ impl Settings for Args {
             dt_s: control.dt_s,
         };
         LimitedFilter::new(filter, Vector3::zeros()).context("bandwidth_rad_s")?;
+        let lag_s = 3.0 / control.omega + control.dead_time_s;
+        ensure!(
+            lag_s <= MAX_LAG_S,
+            "bandwidth_rad_s: {} rad/s and {} s of dead time put the arm {lag_s:.2} s behind its hand, and no operator drives one that is more than {MAX_LAG_S} s behind; {:.2} rad/s is the least, give more",
+            control.omega,
+            control.dead_time_s,
+            3.0 / (MAX_LAG_S - control.dead_time_s)
+        );
         ensure!(
             self.driver.is_none() || self.start.is_none(),
             "start and driver: an arm behind a driver starts where it is; leave one out"
@@ -231,11 +239,26 @@ impl Settings for Args {
         let (urdf, text) = Rig::text(options.urdf.as_deref())?;
         if self.driver.is_some() {
             // Where the arm stands, the driver will say.
-            Rig::arm(&urdf, &text, &options)?;
+            let arm = Rig::arm(&urdf, &text, &options)?;
+            options.control.fits(&arm)?;
         } else {
             Rig::read(urdf, &text, &options)?;
         }
         Ok(())
+    }
+}
+
+/// Operators refuse a robot that says more (docs/protocol.md, `Info`), s.
+const MAX_LAG_S: f64 = 2.0;
+
+/// What was set and cannot be with this arm is no failure: the exit code tells.
+pub(super) fn unusable(error: RigError) -> anyhow::Error {
+    match &error {
+        RigError::Control {
+            source: ControlError::NoEffort { .. },
+            ..
+        } => Unusable::Judged(error.to_string()).into(),
+        _ => error.into(),
     }
 }
 
@@ -294,6 +317,22 @@ mod tests {
         let file: File = toml::from_str(&settings.join("\n")).unwrap();
         assert!(!format!("{file:?}").contains("None"), "a key is missing");
         assert_eq!((file.peers.len(), file.fixed["finger_joint"]), (1, 0.02));
+    }
+
+    #[test]
+    fn a_filter_too_slow_for_any_operator_is_refused() {
+        let slow = |bandwidth, dead_time| {
+            let args = Args {
+                bandwidth: Some(bandwidth),
+                dead_time: Some(dead_time),
+                ..Args::default()
+            };
+            args.judge().map_err(|e| e.to_string())
+        };
+        assert_eq!(slow(1.5, 0.0), Ok(()));
+        let refused = slow(1.5, 0.05).unwrap_err();
+        assert!(refused.contains("1.54 rad/s is the least"), "{refused}");
+        assert!(slow(1.2, 0.0).is_err());
     }
 
     #[test]

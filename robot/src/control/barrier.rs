@@ -18,7 +18,7 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 use telemime_sim::arm::{ArmModel, JointKind, Joints, Kinematics, SelfCollision};
 
-pub use kept::{BarrierConfig, BarrierError, MAX_PLANES, Plane};
+pub use kept::{BarrierConfig, BarrierError, CloseAtStart, MAX_PLANES, Plane};
 
 /// Room that the second stage leaves, m: what a tick may take of it unseen.
 const HARD_M: f64 = 0.004;
@@ -151,6 +151,15 @@ impl Barrier {
             kinematics,
             known: (*start, f64::NEG_INFINITY),
         })
+    }
+
+    /// The links that it does not keep apart because they begin too near each other; none where no links are.
+    pub(super) fn close_at_start(&self) -> Vec<CloseAtStart> {
+        if self.config.self_collision {
+            CloseAtStart::among(&self.arm, &self.hulls)
+        } else {
+            Vec::new()
+        }
     }
 
     /// All that a later tick depends on: a posture, and the room there, m.

@@ -14,9 +14,9 @@ use super::ik::{DifferentialIk, IkState};
 use super::resolve::quaternion;
 use super::turn::checked;
 use super::{
-    BarrierConfig, BarrierError, CartesianLimits, FilterConfig, FilterError, FilterState, IkConfig,
-    JointReference, Law, LimitedFilter, TorqueControl, TurnFilter, TurnLimits, TurnState,
-    joint_accelerations,
+    BarrierConfig, BarrierError, CartesianLimits, CloseAtStart, FilterConfig, FilterError,
+    FilterState, IkConfig, JointReference, Law, LimitedFilter, TorqueControl, TurnFilter,
+    TurnLimits, TurnState, joint_accelerations,
 };
 
 /// The filter's reference may lead the joints' reference by this much, m; beyond, the arm cannot follow and the filter waits for it.
@@ -82,6 +82,22 @@ impl Default for ControlConfig {
     }
 }
 
+impl ControlConfig {
+    /// Whether `arm` states what this needs, wherever it stands.
+    ///
+    /// # Errors
+    /// [`ControlError::NoEffort`] for a stiffness, of the first joint without an effort limit.
+    pub fn fits(&self, arm: &ArmModel) -> Result<(), ControlError> {
+        let unlimited = arm.joints().iter().find(|j| !j.effort.is_finite());
+        match unlimited.filter(|_| self.stiffness.is_some()) {
+            None => Ok(()),
+            Some(joint) => Err(ControlError::NoEffort {
+                joint: joint.name.clone(),
+            }),
+        }
+    }
+}
+
 /// Why a controller cannot be made.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ControlError {
@@ -114,6 +130,14 @@ pub enum ControlError {
         value: f64,
         /// The most that is stable.
         most: f64,
+    },
+    /// A joint without a share of the stiffness.
+    #[error(
+        "a stiffness is shared in proportion to the joints' effort limits, and joint `{joint}` states none; give it one in the URDF, or leave the stiffness out"
+    )]
+    NoEffort {
+        /// The joint.
+        joint: String,
     },
     /// The start posture is not within the arm's limits.
     #[error(transparent)]
@@ -238,6 +262,7 @@ impl Controller {
         q0: &Joints,
     ) -> Result<Self, ControlError> {
         check_start(&arm, q0)?;
+        config.fits(&arm)?;
         for (what, value) in [
             ("joint_bandwidth", config.joint_bandwidth),
             ("orientation_gain", config.orientation_gain),
@@ -318,15 +343,21 @@ impl Controller {
         &self.turn_limits
     }
 
+    /// The links that are not kept apart because they begin too near each other, if links are kept apart at all.
+    pub fn close_at_start(&self) -> Vec<CloseAtStart> {
+        self.ik.barrier().close_at_start()
+    }
+
     /// The time by which the tip lags its demand in position and orientation, s: 3/ω and the arm's dead time.
     pub fn lag_s(&self) -> f64 {
         3.0 / self.filter.config().omega + self.setpoints.seconds()
     }
 
-    /// The largest joint speed among the setpoints that the arm has not obeyed yet, rad/s or m/s.
+    /// The largest joint speed of the reference, and of the setpoints that the arm has not obeyed yet, rad/s or m/s.
     pub fn fastest_on_its_way(&self) -> f64 {
         let waiting = self.setpoints.on_its_way().iter();
-        waiting.map(|r| r.qd.amax()).fold(0.0, f64::max)
+        let all = waiting.chain([self.ik.reference()]);
+        all.map(|r| r.qd.amax()).fold(0.0, f64::max)
     }
 
     /// What has been clamped since the controller was made.

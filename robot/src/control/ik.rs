@@ -195,6 +195,10 @@ impl DifferentialIk {
         self.barrier.clip(target)
     }
 
+    pub(super) fn barrier(&self) -> &Barrier {
+        &self.barrier
+    }
+
     pub(super) fn reference(&self) -> &JointReference {
         &self.reference
     }

@@ -16,7 +16,7 @@ mod turn;
 #[cfg(test)]
 mod tests;
 
-pub use barrier::{BarrierConfig, BarrierError, MAX_PLANES, Plane};
+pub use barrier::{BarrierConfig, BarrierError, CloseAtStart, MAX_PLANES, Plane};
 pub use clamps::{ClampCounts, Clamps};
 pub use controller::{
     ControlConfig, ControlError, Controller, ControllerState, Demand, ForeignState, Output,

@@ -70,7 +70,13 @@ impl TorqueControl {
                 let damping = stiffness.zip_map(&inertia, |k, m| 2.0 * (k * m.max(0.0)).sqrt());
                 let mut reach = Joints::zeros();
                 for (i, joint) in arm.joints().iter().enumerate() {
-                    reach[i] = joint.velocity * damping[i] / stiffness[i];
+                    let thrown = joint.velocity * damping[i] / stiffness[i];
+                    // A joint without a spring is thrown nowhere.
+                    reach[i] = if thrown.is_nan() {
+                        f64::INFINITY
+                    } else {
+                        thrown
+                    };
                 }
                 let error = clamped(&error, &reach);
                 self.dynamics.rnea(qd, &reference.qdd)

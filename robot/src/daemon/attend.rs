@@ -6,7 +6,7 @@ use telemime_endpoint::metrics::Page;
 use telemime_endpoint::supervisor::Supervisor;
 use telemime_endpoint::tally::{CAUSES, STATES, Tally, is_stop};
 use telemime_endpoint::{Meter, Mono};
-use telemime_protocol::wire::v1::RobotState;
+use telemime_protocol::wire::v1::{Cause, RobotState};
 use tokio::sync::watch;
 
 use super::{Active, Daemon};
@@ -48,6 +48,8 @@ pub struct Attendant {
     /// Of the sessions that are over.
     past: Snapshot,
     drains: u32,
+    /// What the last tick was in, and why.
+    told: Option<(RobotState, Cause)>,
     transitions: Option<u32>,
     engagement: Ticket,
     clamps: u32,
@@ -63,6 +65,7 @@ impl Attendant {
             meter,
             past: Snapshot::default(),
             drains: 0,
+            told: None,
             transitions: None,
             engagement: Ticket::default(),
             clamps: 0,
@@ -73,7 +76,9 @@ impl Attendant {
     /// A tick has been reported.
     pub(super) fn saw(&mut self, report: &Report) {
         let past = &mut self.past;
-        let before = past.state.replace(report.state);
+        past.state = Some(report.state);
+        let now = (report.state, report.cause);
+        let before = self.told.replace(now);
         past.faulty = report.fault.is_some();
         if self.engagement != report.engagement {
             self.engagement = report.engagement;
@@ -83,7 +88,7 @@ impl Attendant {
         past.clamps += u64::from(report.clamps.saturating_sub(self.clamps));
         self.clamps = report.clamps;
         if self.transitions.replace(report.transitions) != Some(report.transitions)
-            && is_stop(before, report.state)
+            && is_stop(before, now)
             && let Some(i) = CAUSES.iter().position(|(cause, _)| *cause == report.cause)
         {
             past.stops[i] += 1;

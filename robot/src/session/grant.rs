@@ -72,6 +72,10 @@ impl Session {
             return Err(Refusal::StaleReference);
         }
         let late_s = age_s.max(0.0);
+        let lease = self.lease(now, engage.lease_ms, late_s);
+        if lease.until <= now {
+            return Err(Refusal::StaleReference);
+        }
         let (source, mirror) = match &engage.drive {
             Drive::Mirror {
                 state,
@@ -120,7 +124,7 @@ impl Session {
             source,
             scale: f64::from(engage.scale),
             rotation,
-            lease: self.lease(now, engage.lease_ms, late_s),
+            lease,
         }));
         Ok(())
     }

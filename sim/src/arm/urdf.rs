@@ -78,7 +78,8 @@ pub(super) fn read(text: &str, options: &LoadOptions) -> Result<ArmModel, ArmErr
         notices,
     };
     reader.hulls.begin(reader.tree.root);
-    reader.shapes(reader.tree.root, &Isometry3::identity())?;
+    // The inertia of what does not move is not read.
+    reader.placed(reader.tree.root, Isometry3::identity(), path.first())?;
     let mut joints: Vec<Joint> = Vec::with_capacity(count);
     let mut pose = Isometry3::identity();
     for (i, joint) in path.iter().enumerate() {
@@ -106,7 +107,12 @@ pub(super) fn read(text: &str, options: &LoadOptions) -> Result<ArmModel, ArmErr
         last.body = last.body.joined(&payload.body().moved(&pose));
     }
     let turns = joints.iter().map(turns).collect();
-    let Reader { hulls, notices, .. } = reader;
+    let Reader {
+        hulls,
+        notices,
+        tree: Tree { root, .. },
+        ..
+    } = reader;
     let mut arm = ArmModel {
         name: robot.name.clone(),
         tip: tip.to_owned(),
@@ -116,7 +122,8 @@ pub(super) fn read(text: &str, options: &LoadOptions) -> Result<ArmModel, ArmErr
         capsules: Vec::new(),
         turns,
     };
-    arm.capsules = hulls.capsules(&arm);
+    let chain: Vec<_> = path.iter().map(|j| j.child.link.as_str()).collect();
+    arm.capsules = hulls.capsules(&arm, &[&[root], &chain[..]].concat());
     refuse_massless(&arm)?;
     Ok(arm)
 }
@@ -128,7 +135,7 @@ struct Reader<'a> {
     hulls: Hulls,
 }
 
-impl Reader<'_> {
+impl<'a> Reader<'a> {
     /// What a link at `pose` fills.
     fn shapes(&mut self, link: &str, pose: &Isometry3<f64>) -> Result<(), ArmError> {
         let Some(link) = self.tree.robot.links.iter().find(|l| l.name == link) else {
@@ -175,6 +182,7 @@ impl Reader<'_> {
         let velocity = not_negative("the velocity limit", joint.limit.velocity)?;
         let effort = not_negative("the effort limit", joint.limit.effort)?;
         let acceleration = not_negative("the acceleration limit", joint.limit.acceleration)?;
+        let deceleration = not_negative("the deceleration limit", joint.limit.deceleration)?;
         let (damping, friction) = joint
             .dynamics
             .as_ref()
@@ -206,7 +214,7 @@ impl Reader<'_> {
             upper,
             velocity: stated(velocity),
             effort: stated(effort),
-            acceleration: stated(acceleration),
+            acceleration: stated(acceleration).min(stated(deceleration)),
             damping,
             friction,
             body: Body::EMPTY,
@@ -214,34 +222,43 @@ impl Reader<'_> {
         })
     }
 
-    /// A link at `pose`, with every branch that hangs on it except along `next`.
+    /// The body of a link at `pose`, with every branch that hangs on it except along `next`.
     fn link_and_branches(
         &mut self,
-        link: &str,
+        link: &'a str,
         pose: Isometry3<f64>,
         next: Option<&&urdf_rs::Joint>,
     ) -> Result<Body, ArmError> {
-        self.shapes(link, &pose)?;
-        let mut body = self.link(link)?.moved(&pose);
-        let mut open: Vec<(&urdf_rs::Joint, Isometry3<f64>)> = Vec::new();
-        let off_chain = |j: &&urdf_rs::Joint| next.is_none_or(|n| n.name != j.name);
-        for joint in self.tree.children(link).iter().copied().filter(off_chain) {
-            open.push((joint, pose));
+        let mut body: Option<Body> = None;
+        for (link, pose) in self.placed(link, pose, next)? {
+            let own = self.link(link)?.moved(&pose);
+            body = Some(body.map_or(own, |body| body.joined(&own)));
         }
+        Ok(body.unwrap_or(Body::EMPTY))
+    }
+
+    /// The same links and where they are; their shapes are taken.
+    fn placed(
+        &mut self,
+        link: &'a str,
+        pose: Isometry3<f64>,
+        next: Option<&&urdf_rs::Joint>,
+    ) -> Result<Vec<(&'a str, Isometry3<f64>)>, ArmError> {
+        self.shapes(link, &pose)?;
+        let mut placed = vec![(link, pose)];
+        let off_chain = |j: &&urdf_rs::Joint| next.is_none_or(|n| n.name != j.name);
+        let branches = self.tree.children(link).iter().copied().filter(off_chain);
+        let mut open: Vec<_> = branches.map(|joint| (joint, pose)).collect();
         while let Some((joint, pose)) = open.pop() {
             let pose = pose
                 * isometry(&joint.origin, "origin", &joint.name)?
                 * self.fixed_motion(joint)?;
-            self.shapes(&joint.child.link, &pose)?;
-            body = body.joined(&self.link(&joint.child.link)?.moved(&pose));
-            open.extend(
-                self.tree
-                    .children(&joint.child.link)
-                    .iter()
-                    .map(|j| (*j, pose)),
-            );
+            let link = &joint.child.link;
+            self.shapes(link, &pose)?;
+            placed.push((link, pose));
+            open.extend(self.tree.children(link).iter().map(|j| (*j, pose)));
         }
-        Ok(body)
+        Ok(placed)
     }
 
     /// The motion of a joint that does not move the tip, at the value where it is fixed.

@@ -1,8 +1,10 @@
 //! What is kept apart: what a person sets.
 
+use core::fmt;
+
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
-use telemime_sim::arm::{ArmModel, Joints, SelfCollision};
+use telemime_sim::arm::{ArmModel, Joints, SelfCollision, Unguarded};
 
 use super::SOFT_M;
 
@@ -80,6 +82,40 @@ impl BarrierConfig {
         let free = self.planes.iter_mut().find(|p| p.is_none());
         *free.ok_or(BarrierError::TooManyPlanes)? = Some(plane);
         Ok(self)
+    }
+}
+
+/// Two links whose hulls are too near each other where the arm starts to be kept apart from there on.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CloseAtStart {
+    /// The links, the one nearer to the base first.
+    pub links: [String; 2],
+    /// Between their hulls, m; negative if they overlap.
+    pub distance_m: f64,
+}
+
+impl CloseAtStart {
+    /// Those among the `hulls` of `arm`, which [`BarrierConfig::hulls`] gave.
+    pub fn among(arm: &ArmModel, hulls: &SelfCollision) -> Vec<Self> {
+        let pairs = hulls.unguarded().iter();
+        let close = pairs.filter_map(|&((a, b), why)| match why {
+            Unguarded::AtStart { distance_m } => Some(Self {
+                links: [a, b].map(|i| arm.capsules()[i].link.clone()),
+                distance_m,
+            }),
+            Unguarded::AlwaysClose { .. } => None,
+        });
+        close.collect()
+    }
+}
+
+impl fmt::Display for CloseAtStart {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let ([a, b], mm) = (&self.links, self.distance_m * 1e3);
+        write!(
+            f,
+            "the hulls of `{a}` and `{b}` are {mm:.0} mm apart at the start already: not guarded"
+        )
     }
 }
 

@@ -43,6 +43,46 @@ fn arms_that_cannot_are_refused() {
     );
 }
 
+#[test]
+fn springs_need_an_effort_limit_of_every_joint() {
+    let stiff = ControlConfig {
+        stiffness: Some(100.0),
+        ..ControlConfig::default()
+    };
+    // Of one joint, or of all of them.
+    for (from, to) in [
+        (r#"effort="12""#, r#"effort="0""#),
+        ("effort=", "forgotten="),
+    ] {
+        let urdf = default_urdf().replace(from, to);
+        let arm = Arc::new(ArmModel::from_urdf(&urdf, &LoadOptions::default()).unwrap());
+        let unlimited = arm.joints().iter().find(|j| !j.effort.is_finite()).unwrap();
+        let home = home_posture(&arm);
+        let made = |config| Controller::new(Arc::clone(&arm), config, &home).map(|_| ());
+        assert_eq!(
+            made(&stiff),
+            Err(ControlError::NoEffort {
+                joint: unlimited.name.clone()
+            })
+        );
+        assert_eq!(made(&ControlConfig::default()), Ok(()));
+    }
+}
+
+#[test]
+fn a_joint_without_a_spring_is_carried_and_no_more() {
+    let rig = rig(&ControlConfig::default());
+    let mut stiffness = rig.arm.per_joint(|_| 10.0);
+    stiffness[2] = 0.0;
+    let mut control = TorqueControl::new(Law::Impedance { stiffness });
+    let reference = JointReference {
+        q: rig.home.map(|q| q + 0.1),
+        ..JointReference::default()
+    };
+    let (tau, _) = control.torque(&rig.arm, &reference, &rig.home, &Joints::zeros());
+    assert!(tau.iter().all(|x| x.is_finite()), "{tau}");
+}
+
 /// Three slides of a metre, the last one upright, without any length between them.
 pub(super) fn gantry() -> ArmModel {
     let mut urdf = String::from(r#"<robot name="gantry"><link name="l0"/>"#);

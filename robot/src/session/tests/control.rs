@@ -113,6 +113,19 @@ fn an_engage_the_servo_declines_is_answered() {
 }
 
 #[test]
+fn a_request_whose_lease_is_over_when_it_arrives_came_too_late() {
+    for (lease_ms, refused) in [(250, Some(Refusal::StaleReference)), (350, None)] {
+        let mut bench = Bench::ready(None);
+        let engage = Engage {
+            lease_ms,
+            ..bench.mirror(1)
+        };
+        bench.pass(300);
+        assert_eq!(bench.refusal(&engage), refused, "{lease_ms} ms");
+    }
+}
+
+#[test]
 fn the_arms_state_decides_whether_it_may_engage() {
     let mut bench = Bench::fresh(None);
     for _ in 0..4 {

@@ -170,3 +170,27 @@ fn a_step_too_long_for_an_explicit_rule_is_survived() {
         }
     }
 }
+
+#[test]
+fn the_smaller_of_acceleration_and_deceleration_is_the_limit() {
+    let with = |attributes: &str| {
+        let urdf = default_urdf()
+            .replace(r#"<robot "#, r#"<robot version="1.2" "#)
+            .replacen("effort=\"87\"", &format!("effort=\"87\" {attributes}"), 1);
+        ArmModel::from_urdf(&urdf, &LoadOptions::default()).map(|arm| arm.joints()[0].acceleration)
+    };
+    for (attributes, limit) in [
+        ("", f64::INFINITY),
+        (r#"acceleration="5""#, 5.0),
+        (r#"acceleration="5" deceleration="3""#, 3.0),
+        (r#"acceleration="5" deceleration="8""#, 5.0),
+        (r#"deceleration="3""#, 3.0),
+        (r#"acceleration="5" deceleration="0""#, 5.0),
+    ] {
+        assert_eq!(with(attributes), Ok(limit), "{attributes}");
+    }
+    for wrong in ["-1", "NaN"] {
+        let refused = with(&format!(r#"deceleration="{wrong}""#));
+        assert!(refused.is_err(), "{wrong}: {refused:?}");
+    }
+}
