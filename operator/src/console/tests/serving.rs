@@ -246,6 +246,77 @@ fn a_page_that_says_too_much_is_left() {
     assert!(farewell(&mut page).contains("400 commands"));
 }
 
+/// Says goodbye as well as a page that has been left, and returns all that the daemon was to hear until it was.
+fn heard_of(mut page: BufReader<TcpStream>, served: &mut Served) -> Vec<Said> {
+    page.get_mut().write_all(&[0x88, 0x80, 0, 0, 0, 0]).unwrap();
+    let mut rest = Vec::new();
+    let _ = page.read_to_end(&mut rest);
+    std::iter::from_fn(|| served.commands.try_recv().ok())
+        .map(|(_, said)| said)
+        .collect()
+}
+
+#[test]
+fn a_stop_behind_what_a_page_is_left_for_is_obeyed() {
+    let stop = Said::Command(Command::Stop {});
+    for (many, what, why) in [
+        (500, r#"{"do":"alive"}"#, "400 commands"),
+        (25, "{}", "not a command"),
+    ] {
+        let mut served = served_with_room("127.0.0.1:0", 1000);
+        let mut page = served.page();
+        for _ in 0..many {
+            say(&mut page, what);
+        }
+        say(&mut page, r#"{"do":"stop"}"#);
+        assert!(farewell(&mut page).contains(why));
+        let heard = heard_of(page, &mut served);
+        assert_eq!(heard.last(), Some(&stop), "{why}");
+    }
+}
+
+#[test]
+fn stop_is_never_said_too_often() {
+    let mut served = served_with_room("127.0.0.1:0", 1000);
+    let mut page = served.page();
+    for _ in 0..500 {
+        say(&mut page, r#"{"do":"stop"}"#);
+    }
+    let heard = heard_of(page, &mut served);
+    let stops = heard
+        .iter()
+        .filter(|said| **said == Said::Command(Command::Stop {}));
+    assert_eq!(stops.count(), 500);
+}
+
+/// The page vanishes while its stop still waits for a daemon that is behind.
+#[test]
+fn a_stop_that_waits_outlives_its_page() {
+    let mut served = served_with_room("127.0.0.1:0", 1);
+    let mut page = served.page();
+    say(&mut page, r#"{"do":"stop"}"#);
+    // It has been heard once the snapshots that it does not read are written to nobody.
+    drop(page);
+    while served.snapshots.receiver_count() > 1 {
+        served.snapshots.send_replace(Arc::default());
+        std::thread::yield_now();
+    }
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_time()
+        .build()
+        .unwrap();
+    let all = async {
+        while let Some((_, said)) = served.commands.recv().await {
+            if said == Said::Command(Command::Stop {}) {
+                return;
+            }
+        }
+    };
+    let within = Duration::from_secs(30);
+    let heard = runtime.block_on(async { tokio::time::timeout(within, all).await });
+    assert!(heard.is_ok(), "the stop was dropped");
+}
+
 /// Nobody reads: snapshots take each other's place, and none of them waits anywhere.
 #[test]
 fn a_page_that_stalls_loses_snapshots_and_holds_up_nothing() {
