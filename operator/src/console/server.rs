@@ -49,6 +49,9 @@ const PING: Duration = Duration::from_secs(5);
 /// … and has gone if nothing came from it for this long.
 const GONE: Duration = Duration::from_secs(15);
 
+/// A connection that is not a page by then is closed, whatever it asks.
+const STAY: Duration = Duration::from_secs(60);
+
 /// A page that is left gets this long to hear why.
 const FAREWELL: Duration = Duration::from_secs(1);
 
@@ -92,6 +95,20 @@ struct Shared {
 /// # Errors
 /// [`ServeError`].
 pub fn serve(addr: SocketAddr, random: [u8; 16], port: Port) -> Result<String, ServeError> {
+    let limits = Limits {
+        connections: MAX_CONNECTIONS,
+        request: REQUEST,
+        stay: STAY,
+    };
+    serve_within(limits, addr, random, port)
+}
+
+pub(super) fn serve_within(
+    limits: Limits,
+    addr: SocketAddr,
+    random: [u8; 16],
+    port: Port,
+) -> Result<String, ServeError> {
     let bind = |source| ServeError::Bind { addr, source };
     let listener = TcpListener::bind(addr).map_err(bind)?;
     listener.set_nonblocking(true)?;
@@ -115,11 +132,6 @@ pub fn serve(addr: SocketAddr, random: [u8; 16], port: Port) -> Result<String, S
         .spawn(move || {
             runtime.block_on(async {
                 if let Ok(listener) = tokio::net::TcpListener::from_std(listener) {
-                    let limits = Limits {
-                        connections: MAX_CONNECTIONS,
-                        request: REQUEST,
-                        stay: None,
-                    };
                     http::serve(listener, router(shared), limits).await;
                 }
             });
