@@ -229,6 +229,44 @@ async function stops(person, other) {
   await page.click("#reset");
   await person.state("Ready");
 
+  step("a stop that was lost with the connection is said by the next one; held down, the key says it once");
+  await page.evaluate(() => {
+    const { link } = telemime;
+    const say = link.say;
+    globalThis.stops = 0;
+    link.say = function (command) {
+      if (command.do !== "stop") return say.call(link, command);
+      globalThis.stops += 1;
+      // Taken by the browser, and never heard of again.
+      return true;
+    };
+  });
+  await page.keyboard.down("Escape");
+  await page.keyboard.down("Escape");
+  await page.keyboard.up("Escape");
+  assert.equal(await page.evaluate(() => globalThis.stops), 1);
+  await page.evaluate(() => {
+    delete telemime.link.say;
+    telemime.link.socket.close();
+  });
+  await other.state("Stopped");
+  await person.until(() => telemime.link.now?.robot?.state === "Stopped" && !telemime.drive.owed);
+  await page.click("#reset");
+  await person.state("Ready");
+
+  step("a connection on which nothing comes any more is not shown as live, and is made anew");
+  await page.evaluate(() => {
+    const { link } = telemime;
+    const { socket } = link;
+    globalThis.dead = false;
+    link.addEventListener("link", ({ detail }) => (globalThis.dead ||= !detail.open && detail.why.includes("nothing comes")));
+    // As if the network swallowed it: neither a message nor its end.
+    for (const kind of ["message", "close"]) socket.addEventListener(kind, (event) => event.stopImmediatePropagation(), true);
+  });
+  await person.until(() => globalThis.dead && document.getElementById("log").textContent.includes("nothing comes"));
+  await person.until(() => telemime.link.now?.linked);
+  await person.state("Ready");
+
   step("a page that dies while it drives has let go");
   await person.engages();
   await page.close();
