@@ -257,14 +257,17 @@ async function stops(person, other) {
   step("a connection on which nothing comes any more is not shown as live, and is made anew");
   await page.evaluate(() => {
     const { link } = telemime;
-    const { socket } = link;
-    globalThis.dead = false;
-    link.addEventListener("link", ({ detail }) => (globalThis.dead ||= !detail.open && detail.why.includes("nothing comes")));
-    // As if the network swallowed it: neither a message nor its end.
-    for (const kind of ["message", "close"]) socket.addEventListener(kind, (event) => event.stopImmediatePropagation(), true);
+    globalThis.WebSocket = class extends WebSocket {
+      addEventListener(kind, does) {
+        super.addEventListener(kind, (event) => this === globalThis.dead || does(event));
+      }
+    };
+    link.socket.close();
+    link.addEventListener("now", () => (globalThis.dead ??= link.socket));
   });
-  await person.until(() => globalThis.dead && document.getElementById("log").textContent.includes("nothing comes"));
-  await person.until(() => telemime.link.now?.linked);
+  // As if the network swallowed it: neither a message nor its end.
+  await person.until(() => document.getElementById("log").textContent.includes("nothing comes from the operator"));
+  await person.until(() => globalThis.dead && telemime.link.socket !== globalThis.dead && telemime.link.now?.linked);
   await person.state("Ready");
 
   step("a page that dies while it drives has let go");
