@@ -174,7 +174,10 @@ fn an_operator_whose_words_nobody_takes_ends_the_session_at_both_ends() {
                 _ => None,
             })
             .unwrap();
-        assert!(why.contains("does not read"), "{why}");
+        assert_eq!(
+            why,
+            "closed by the peer: the peer does not read what is sent"
+        );
         assert!(pair.wait_for(1.0, |r| r.state == RobotState::Stopped).await);
     })
     .unwrap();
