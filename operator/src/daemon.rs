@@ -175,6 +175,7 @@ impl Daemon {
             if stop {
                 session.stop(self.now());
             }
+            let connection = link.connection.clone();
             let end = self
                 .drive(
                     (&mut session, &mut last),
@@ -200,6 +201,8 @@ impl Daemon {
                     break;
                 }
                 End::Lost(why) => {
+                    // Or what the writer has yet to say would keep the robot busy with a session that nobody drives.
+                    connection.close(VarInt::from_u32(0), why.as_bytes());
                     task.on_lost(&why);
                     let _ = notices.send(Notice::Lost { why });
                 }

@@ -315,6 +315,8 @@ impl Task {
             )),
             // The next session is asked as soon as it is there.
             Phase::Waiting(_) => self.phase = Phase::Waiting(None),
+            // Nothing is left to do that would need a link.
+            Phase::Leaving(_) if matches!(self.work, Work::Play { .. }) => self.phase = Phase::Over,
             Phase::Leaving(_) | Phase::Between | Phase::Over => {}
         }
     }
@@ -353,7 +355,10 @@ impl Task {
             Event::State(RobotState::Stopped, _) => self.give_up(
                 "the emergency stop is latched; type reset at either end when it is safe".into(),
             ),
-            Event::State(RobotState::Ready, Cause::PlanFinished) => {
+            // A former operator's motion is not ours either.
+            Event::State(RobotState::Ready, Cause::PlanFinished)
+                if self.phase == Phase::Engaged =>
+            {
                 self.phase = Phase::Leaving(now.offset_by_secs(LEAVE_S));
             }
             Event::Ready

@@ -229,6 +229,47 @@ async function stops(person, other) {
   await page.click("#reset");
   await person.state("Ready");
 
+  step("a stop that was lost with the connection is said by the next one; held down, the key says it once");
+  await page.evaluate(() => {
+    const { link } = telemime;
+    const say = link.say;
+    globalThis.stops = 0;
+    link.say = function (command) {
+      if (command.do !== "stop") return say.call(link, command);
+      globalThis.stops += 1;
+      // Taken by the browser, and never heard of again.
+      return true;
+    };
+  });
+  await page.keyboard.down("Escape");
+  await page.keyboard.down("Escape");
+  await page.keyboard.up("Escape");
+  assert.equal(await page.evaluate(() => globalThis.stops), 1);
+  await page.evaluate(() => {
+    delete telemime.link.say;
+    telemime.link.socket.close();
+  });
+  await other.state("Stopped");
+  await person.until(() => telemime.link.now?.robot?.state === "Stopped" && !telemime.drive.owed);
+  await page.click("#reset");
+  await person.state("Ready");
+
+  step("a connection on which nothing comes any more is not shown as live, and is made anew");
+  await page.evaluate(() => {
+    const { link } = telemime;
+    globalThis.WebSocket = class extends WebSocket {
+      addEventListener(kind, does) {
+        super.addEventListener(kind, (event) => this === globalThis.dead || does(event));
+      }
+    };
+    link.socket.close();
+    link.addEventListener("now", () => (globalThis.dead ??= link.socket));
+  });
+  // As if the network swallowed it: neither a message nor its end.
+  await person.until(() => document.getElementById("log").textContent.includes("nothing comes from the operator"));
+  await person.until(() => globalThis.dead && telemime.link.socket !== globalThis.dead && telemime.link.now?.linked);
+  await person.state("Ready");
+
   step("a page that dies while it drives has let go");
   await person.engages();
   await page.close();

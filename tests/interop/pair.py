@@ -1,6 +1,6 @@
 """Pairs a Python operator with `telemime robot` by the code alone, and asserts that whatever differs ends without a pin: a code
-that one user or the other refuses, a key that was not expected, a second attempt, a message out of turn, a session of a stranger,
-and somebody in between who hands on every message of `telemime pair`.
+that one user or the other refuses, a key that was not expected, a second attempt, a message out of turn or none, a session of a
+stranger, and somebody in between who hands on every message of `telemime pair`.
 
 Usage: pair.py PROGRAM, where PROGRAM is the `telemime` binary. Needs aioquic; `run` makes the environment.
 """
@@ -123,6 +123,15 @@ async def out_of_turn(program, folder):
             await ended(robot, pairing, OUT_OF_TURN, "a Confirm before all else")
 
 
+async def silent(program, folder):
+    key, certificate = identity()
+    with robot_at(program, folder, "--pair") as robot:
+        async with introduce(robot.host, robot.port, key, certificate) as pairing:
+            pairing.say({"Offer": {"name": "mute"}})
+            await pairing.hear("Commit")
+            await ended(robot, pairing, OUT_OF_TURN, "nothing where a Nonce is due")
+
+
 async def hand_on(one, other):
     while "Closed" not in (message := await one.heard.get()):
         other.say(message)
@@ -163,7 +172,7 @@ async def in_between(program, folder):
 
 
 def main():
-    for play in (by_the_code, another_code, no_at_the_robot, another_key, out_of_turn, in_between):
+    for play in (by_the_code, another_code, no_at_the_robot, another_key, out_of_turn, silent, in_between):
         with tempfile.TemporaryDirectory() as folder:
             asyncio.run(play(sys.argv[1], folder))
     print("paired by the code, and by nothing else")

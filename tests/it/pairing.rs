@@ -255,6 +255,29 @@ fn somebody_in_between_makes_the_codes_differ() {
 }
 
 #[test]
+fn an_end_that_is_silent_is_told_so() {
+    run_virtual(async {
+        let mut pair = Pair::start(&rig()).unwrap();
+        let laptop = Identity::ephemeral().unwrap();
+        pair.robot.say(Word::Pair(WINDOW));
+        pair.run_for(0.1).await;
+        let connection = suit(&mut pair, &laptop, 12).await.unwrap();
+        let (mut send, mut recv) = connection.open_bi().await.unwrap();
+        let offer = PairMessage::Offer(own(&laptop).name);
+        send.write_all(&offer.encode()).await.unwrap();
+        let said = recv.read_to_end(256).await.unwrap();
+        let (commit, used) = PairMessage::decode(&said).unwrap().unwrap();
+        assert!(matches!(commit, PairMessage::Commit(..)));
+        let (abort, _) = PairMessage::decode(&said[used..]).unwrap().unwrap();
+        let PairMessage::Abort(AbortCode::Malformed, text) = abort else {
+            panic!("{abort:?}");
+        };
+        assert!(text.contains("said nothing for 5 s"), "{text}");
+    })
+    .unwrap();
+}
+
+#[test]
 fn a_robot_that_reveals_another_nonce_than_it_committed_to_is_caught() {
     run_virtual(async {
         let network = telemime::ground::Network::new();

@@ -7,6 +7,7 @@ use std::time::Duration;
 use nalgebra::Vector3;
 use telemime::ground::{Operator, Pair, run_virtual};
 use telemime_endpoint::External;
+use telemime_endpoint::cli::Word;
 use telemime_operator::daemon::Notice;
 use telemime_operator::session::Event;
 use telemime_operator::task::Task;
@@ -141,6 +142,45 @@ fn news_is_back_two_round_trips_and_a_redial_after_the_link() {
             .unwrap();
         }
     }
+}
+
+/// What the operator has yet to say is no reason for the robot to stay busy with a session that the operator has given up.
+#[test]
+fn an_operator_whose_words_nobody_takes_ends_the_session_at_both_ends() {
+    run_virtual(async {
+        let mut pair = Pair::start(&rig()).unwrap();
+        let mut operator = operator(&mut pair, &delayed(0.03), 70);
+        assert!(
+            pair.wait_for(20.0, |r| r.state == RobotState::Engaged)
+                .await
+        );
+        let mut heard = Heard::default();
+        hear(&mut operator, &mut heard);
+        pair.network.set_down(true);
+        // More than QUIC takes while nothing is acknowledged, and the queue before it.
+        for _ in 0..20_000 {
+            operator.say(Word::Stop);
+        }
+        pair.run_for(0.1).await;
+        pair.network.set_down(false);
+        let took = heard_again(&pair, &mut operator, &mut heard, true).await;
+        assert!(took.is_some(), "never back");
+        let why = pair
+            .robot
+            .notices()
+            .iter()
+            .find_map(|notice| match notice {
+                RobotNotice::Disconnected { why, .. } => Some(why.clone()),
+                _ => None,
+            })
+            .unwrap();
+        assert_eq!(
+            why,
+            "closed by the peer: the peer does not read what is sent"
+        );
+        assert!(pair.wait_for(1.0, |r| r.state == RobotState::Stopped).await);
+    })
+    .unwrap();
 }
 
 /// A greeting that overtakes the handshake's last packet would be thrown away, and cost a round trip more.

@@ -39,8 +39,11 @@ pub enum Command {
     Release {},
     /// Emergency stop.
     Stop {},
-    /// Leaves the latched stop.
-    Reset {},
+    /// Leaves the latched stop that the page shows.
+    Reset {
+        /// The `changes` of the robot as the page was shown them.
+        changes: u32,
+    },
     /// Prediction gain κ.
     Predict {
         /// In [0, 1].
@@ -172,7 +175,7 @@ impl Command {
             Self::Alive {}
             | Self::Release {}
             | Self::Stop {}
-            | Self::Reset {}
+            | Self::Reset { .. }
             | Self::Discard {} => {}
         }
         Ok(command)

@@ -49,6 +49,9 @@ const PING: Duration = Duration::from_secs(5);
 /// … and has gone if nothing came from it for this long.
 const GONE: Duration = Duration::from_secs(15);
 
+/// A connection that is not a page by then is closed, whatever it asks.
+const STAY: Duration = Duration::from_secs(60);
+
 /// A page that is left gets this long to hear why.
 const FAREWELL: Duration = Duration::from_secs(1);
 
@@ -92,6 +95,20 @@ struct Shared {
 /// # Errors
 /// [`ServeError`].
 pub fn serve(addr: SocketAddr, random: [u8; 16], port: Port) -> Result<String, ServeError> {
+    let limits = Limits {
+        connections: MAX_CONNECTIONS,
+        request: REQUEST,
+        stay: STAY,
+    };
+    serve_within(limits, addr, random, port)
+}
+
+pub(super) fn serve_within(
+    limits: Limits,
+    addr: SocketAddr,
+    random: [u8; 16],
+    port: Port,
+) -> Result<String, ServeError> {
     let bind = |source| ServeError::Bind { addr, source };
     let listener = TcpListener::bind(addr).map_err(bind)?;
     listener.set_nonblocking(true)?;
@@ -115,11 +132,6 @@ pub fn serve(addr: SocketAddr, random: [u8; 16], port: Port) -> Result<String, S
         .spawn(move || {
             runtime.block_on(async {
                 if let Ok(listener) = tokio::net::TcpListener::from_std(listener) {
-                    let limits = Limits {
-                        connections: MAX_CONNECTIONS,
-                        request: REQUEST,
-                        stay: None,
-                    };
                     http::serve(listener, router(shared), limits).await;
                 }
             });
@@ -213,28 +225,33 @@ async fn socket(State(shared): State<Arc<Shared>>, upgrade: WebSocketUpgrade) ->
 /// One page, as long as it is there. Listening and telling do not wait for each other.
 async fn page(shared: &Shared, socket: WebSocket) {
     let number = shared.numbers.fetch_add(1, Ordering::Relaxed);
-    let (mut out, mut heard) = socket.split();
+    let (mut out, heard) = socket.split();
     let commands = &shared.port.commands;
+    let mut ear = Ear {
+        heard,
+        commands,
+        number,
+        owes_stop: false,
+    };
     // A daemon that takes nothing has more to do than to know who looks.
     let _ = commands.try_send((number, Said::Here));
     let why = tokio::select! {
         why = tell(&mut out, shared, number) => why,
-        why = listen(&mut heard, commands, number) => why,
+        why = ear.listen() => why,
     };
     // If there is no room for it, the lease says the same.
     let _ = commands.try_send((number, Said::Gone));
-    if let Some(why) = why {
-        let frame = CloseFrame {
-            code: 1008,
-            reason: why.into(),
-        };
-        let farewell = async {
+    let told = async {
+        if let Some(why) = why {
+            let frame = CloseFrame {
+                code: 1008,
+                reason: why.into(),
+            };
             let _ = out.send(Message::Close(Some(frame))).await;
-            // What is still on its way is read, or the connection would be reset before the page has heard why.
-            while let Some(Ok(_)) = heard.next().await {}
-        };
-        let _ = timeout(FAREWELL, farewell).await;
-    }
+        }
+    };
+    let _ = timeout(FAREWELL, async { tokio::join!(told, ear.hear_out()) }).await;
+    ear.stop_if_owed().await;
 }
 
 #[derive(Serialize)]
@@ -302,47 +319,85 @@ async fn tell(
     }
 }
 
-async fn listen(
-    heard: &mut SplitStream<WebSocket>,
-    commands: &mpsc::Sender<(u64, Said)>,
+/// What a page says, on its way to the daemon.
+struct Ear<'a> {
+    heard: SplitStream<WebSocket>,
+    commands: &'a mpsc::Sender<(u64, Said)>,
     number: u64,
-) -> Option<String> {
-    let (mut second, mut count, mut wrong) = (Instant::now(), 0, 0);
-    loop {
-        let message = match timeout(GONE, heard.next()).await.ok()? {
-            Some(Ok(message)) => message,
-            // Too long, or not a WebSocket any more.
-            Some(Err(e)) => return Some(e.to_string().chars().take(100).collect()),
-            None => return None,
-        };
-        if second.elapsed() >= Duration::from_secs(1) {
-            (second, count) = (Instant::now(), 0);
-        }
-        count += 1;
-        if count > MOST_COMMANDS {
-            return Some(format!("more than {MOST_COMMANDS} commands in a second"));
-        }
-        let command = match &message {
-            Message::Text(text) => Command::parse(text),
-            Message::Close(_) => return None,
-            Message::Ping(_) | Message::Pong(_) => continue,
-            Message::Binary(_) => Command::parse(""),
-        };
-        match command {
-            // A stop waits for its place, and only its own page with it.
-            Ok(command @ Command::Stop {}) => {
-                drop(commands.send((number, Said::Command(command))).await);
+    /// It said stop, and the daemon does not have it yet.
+    owes_stop: bool,
+}
+
+impl Ear<'_> {
+    /// Says why the page is to be left, if it is to be told.
+    async fn listen(&mut self) -> Option<String> {
+        let (mut second, mut count, mut wrong) = (Instant::now(), 0, 0);
+        loop {
+            let message = match timeout(GONE, self.heard.next()).await.ok()? {
+                Some(Ok(message)) => message,
+                // Too long, or not a WebSocket any more.
+                Some(Err(e)) => return Some(e.to_string().chars().take(100).collect()),
+                None => return None,
+            };
+            let command = match &message {
+                Message::Text(text) => Some(Command::parse(text)),
+                Message::Close(_) => return None,
+                Message::Ping(_) | Message::Pong(_) => None,
+                Message::Binary(_) => Some(Command::parse("")),
+            };
+            // Waits for its place, and only its own page with it; nobody says it too often.
+            if let Some(Ok(Command::Stop {})) = command {
+                self.owes_stop = true;
+                self.stop_if_owed().await;
+                continue;
             }
-            // Full: the daemon is behind, and what it does not hear is not obeyed.
-            Ok(command) => drop(commands.try_send((number, Said::Command(command)))),
-            Err(why) => {
-                wrong += 1;
-                let why = why.to_string().chars().take(100).collect::<String>();
-                if wrong >= MOST_WRONG {
-                    return Some(why);
+            if second.elapsed() >= Duration::from_secs(1) {
+                (second, count) = (Instant::now(), 0);
+            }
+            count += 1;
+            if count > MOST_COMMANDS {
+                return Some(format!("more than {MOST_COMMANDS} commands in a second"));
+            }
+            match command {
+                None => {}
+                Some(Ok(command)) => self.try_say(Said::Command(command)),
+                Some(Err(why)) => {
+                    wrong += 1;
+                    let why = why.to_string().chars().take(100).collect::<String>();
+                    if wrong >= MOST_WRONG {
+                        return Some(why);
+                    }
+                    self.try_say(Said::Wrong(why));
                 }
-                let _ = commands.try_send((number, Said::Wrong(why)));
             }
         }
+    }
+
+    /// What is still on its way from a page that is left: a stop is obeyed, and the rest only read, or the connection
+    /// would be reset before the page has heard why.
+    async fn hear_out(&mut self) {
+        self.stop_if_owed().await;
+        while let Some(Ok(message)) = self.heard.next().await {
+            if let Message::Text(text) = message
+                && let Ok(Command::Stop {}) = Command::parse(&text)
+            {
+                self.owes_stop = true;
+                self.stop_if_owed().await;
+            }
+        }
+    }
+
+    /// Waits until there is room for it; who cancels that still owes it.
+    async fn stop_if_owed(&mut self) {
+        if self.owes_stop {
+            let stop = Said::Command(Command::Stop {});
+            drop(self.commands.send((self.number, stop)).await);
+            self.owes_stop = false;
+        }
+    }
+
+    /// Where there is no room the daemon is behind, and what it does not hear is not obeyed.
+    fn try_say(&self, said: Said) {
+        let _ = self.commands.try_send((self.number, said));
     }
 }

@@ -66,8 +66,10 @@ pub struct Robot {
     pub name: String,
     /// Its state …
     pub state: String,
-    /// … and why.
+    /// … why …
     pub cause: String,
+    /// … and how often it has changed: a reset names it.
+    pub changes: u32,
     /// Largest tip speed, m/s.
     pub speed_m_s: f32,
     /// How far the tip may go, m.

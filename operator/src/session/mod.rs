@@ -207,6 +207,11 @@ impl Session {
         self.engagement
     }
 
+    /// How often the robot's state has changed, by its newest report.
+    pub fn changes(&self) -> u32 {
+        self.changes
+    }
+
     /// What passed, by kind.
     pub fn tally(&self) -> &Tally {
         &self.tally

@@ -163,3 +163,42 @@ fn a_stop_between_two_recordings_ends_the_task() {
     assert_eq!(task.advise(now, &mut session), Advice::Finished);
     assert!(matches!(task.outcome(false), Outcome::Interrupted(_)));
 }
+
+/// What a robot says of the operator before, which ended in the middle of it.
+#[test]
+fn a_motion_that_ended_before_ours_began_is_not_ours() {
+    let ended = Event::State(RobotState::Ready, Cause::PlanFinished);
+    for mut task in [replay(), play()] {
+        let (mut session, mut now) = (ready(), at(0));
+        task.on_event(now, &ended);
+        for _ in 0..20 {
+            assert_eq!(task.advise(now, &mut session), Advice::Continue);
+            task.on_event(now, &ended);
+            now = now.offset_by_secs(0.05);
+        }
+        assert_eq!(task.requests, 1, "it is asked all the same");
+        assert!(!task.has_released());
+        task.on_event(now, &granted());
+        assert!(!task.is_over(now));
+    }
+    let (mut task, mut session) = (play(), ready());
+    task.advise(at(0), &mut session);
+    task.on_event(at(50), &granted());
+    task.on_event(at(2000), &ended);
+    assert!(task.has_released(), "and ours is");
+}
+
+#[test]
+fn a_motion_that_was_played_is_not_called_back_for() {
+    let (mut task, mut session) = (play(), ready());
+    task.advise(at(0), &mut session);
+    task.on_event(at(50), &granted());
+    task.on_event(
+        at(2000),
+        &Event::State(RobotState::Ready, Cause::PlanFinished),
+    );
+    assert!(!task.is_over(at(2100)), "the arm comes to rest");
+    task.on_lost("cut");
+    assert!(task.is_over(at(2100)));
+    assert_eq!(task.outcome(false), Outcome::Completed);
+}

@@ -21,8 +21,9 @@ pub struct Limits {
     pub connections: usize,
     /// A connection that has not asked for anything by now is left.
     pub request: Duration,
-    /// A connection ends after this, whatever its peer does; `None`: it may stay.
-    pub stay: Option<Duration>,
+    /// A connection ends after this, whatever its peer does, unless it has become another protocol's by then (a
+    /// WebSocket): that one is its handler's to end.
+    pub stay: Duration,
 }
 
 /// Serves `router` on `listener`, for ever.
@@ -43,10 +44,7 @@ pub async fn serve(listener: TcpListener, router: Router, limits: Limits) {
                 .header_read_timeout(limits.request)
                 .serve_connection(TokioIo::new(stream), service)
                 .with_upgrades();
-            match limits.stay {
-                Some(stay) => drop(timeout(stay, connection).await),
-                None => drop(connection.await),
-            }
+            let _ = timeout(limits.stay, connection).await;
             drop(place);
         });
     }

@@ -200,7 +200,7 @@ pub fn serve(
                     let limits = Limits {
                         connections: MAX_SCRAPERS,
                         request: STAY,
-                        stay: Some(STAY),
+                        stay: STAY,
                     };
                     http::serve(listener, router, limits).await;
                 }

@@ -152,7 +152,8 @@ impl Stream {
         let next = timeout(GREETING_TIMEOUT, self.next()).await;
         let next = next.map_err(|_| {
             let waited = GREETING_TIMEOUT.as_secs();
-            PairError::Connection(format!("the other end said nothing for {waited} s"))
+            let text = format!("the other end said nothing for {waited} s");
+            ours(AbortCode::Malformed, text)
         })?;
         pick(next?).ok_or_else(|| ours(AbortCode::Malformed, "a message out of turn"))
     }

@@ -91,7 +91,7 @@ pub enum AbortCode {
     NameTaken,
     /// The key was revoked.
     Revoked,
-    /// A message is none, or not the one that is due.
+    /// A message is none, or not the one that is due, or not there in time.
     Malformed,
     /// The nonce is not the one committed to: somebody stands in between.
     Commitment,

@@ -271,8 +271,12 @@ impl Live {
                 }
             }
             Command::Hand { t, x } => self.moved(now, t, x, session),
-            Command::Reset {} => {
+            Command::Reset { changes } => {
                 let session = session.ok_or("there is no link: reset again when it is back")?;
+                // A stop that the page has not seen is not for it to leave.
+                if changes != session.changes() {
+                    return Err("the robot's state is not the one that was to be reset: look, and reset again".into());
+                }
                 if !session.reset() {
                     return Err("the robot has not confirmed the stop yet".into());
                 }

@@ -64,14 +64,17 @@ impl Live {
                 Holding::Record => "record",
                 Holding::Play => "play",
             }),
-            robot: session.and_then(Session::info).map(|info| Robot {
-                name: info.name.clone(),
-                state: format!("{:?}", self.state.0),
-                cause: format!("{:?}", self.state.1),
-                speed_m_s: info.speed_m_s,
-                radius_m: info.radius_m,
-                lag_ms: f64::from(info.lag_s) * 1e3,
-            }),
+            robot: session
+                .and_then(|session| Some((session.info()?, session)))
+                .map(|(info, session)| Robot {
+                    name: info.name.clone(),
+                    state: format!("{:?}", self.state.0),
+                    cause: format!("{:?}", self.state.1),
+                    changes: session.changes(),
+                    speed_m_s: info.speed_m_s,
+                    radius_m: info.radius_m,
+                    lag_ms: f64::from(info.lag_s) * 1e3,
+                }),
             arm: self.telemetry.as_ref().map(|telemetry| Arm {
                 t: telemetry.t_us as f64 * 1e-3,
                 q: telemetry.q.clone(),

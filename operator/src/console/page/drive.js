@@ -61,10 +61,10 @@ export class Drive extends EventTarget {
     this.lost();
   }
 
-  /** The emergency stop; without a connection, as soon as there is one. */
+  /** The emergency stop: owed until the robot is seen to have stopped, and said again by every connection until then. */
   stop() {
-    this.owed = !this.link.say({ do: "stop" });
-    if (this.owed) this.dispatchEvent(new Event("owed"));
+    this.owed = true;
+    if (!this.link.say({ do: "stop" })) this.dispatchEvent(new Event("owed"));
     this.end();
   }
 
@@ -74,7 +74,8 @@ export class Drive extends EventTarget {
     this.changed();
   }
 
-  heard({ you }) {
+  heard({ you, linked, robot }) {
+    if (linked && robot?.state === "Stopped") this.owed = false;
     if (!this.what) return;
     // Whoever let go at the other end, the clutch must be pressed anew.
     if (this.granted && you !== true) this.end();
@@ -170,7 +171,7 @@ export class Drive extends EventTarget {
 
   typing() {
     addEventListener("keydown", (event) => {
-      if (event.key === "Escape") return this.stop();
+      if (event.key === "Escape") return event.repeat || this.stop();
       if (event.ctrlKey || event.metaKey || event.altKey) return;
       const field = event.target.closest?.("input:not([type=checkbox]), select, textarea");
       this.fine = event.shiftKey;

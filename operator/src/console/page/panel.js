@@ -40,7 +40,7 @@ export class Panel {
     // At once, wherever the finger goes then; a click that no pointer made is a key's or a screen reader's.
     $("stop").addEventListener("pointerdown", () => drive.stop());
     $("stop").addEventListener("click", (event) => event.detail === 0 && drive.stop());
-    $("reset").addEventListener("click", () => link.say({ do: "reset" }));
+    $("reset").addEventListener("click", () => link.say({ do: "reset", changes: link.now?.robot?.changes }));
     $("predict").addEventListener("change", (event) => {
       this.switched = performance.now();
       link.say({ do: "predict", gain: event.target.checked ? 1 : 0 });

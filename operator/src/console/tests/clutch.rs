@@ -135,7 +135,10 @@ impl Bench {
     }
 
     fn state(&mut self, state: RobotState, cause: Cause) {
-        let changes = 1;
+        self.changed(state, cause, 1);
+    }
+
+    fn changed(&mut self, state: RobotState, cause: Cause, changes: u32) {
         self.hears(&RobotControl::State {
             state,
             cause,
@@ -250,6 +253,36 @@ fn one_page_drives_and_anybody_stops() {
     assert_eq!(bench.releases(), 1);
     bench.hand(1, 0.6, 0.0);
     assert_eq!(bench.engages(), 1, "what was stopped stays stopped");
+}
+
+/// Two pages saw the same stop; one of them has reset it and stopped anew before the other's reset arrives.
+#[test]
+fn a_reset_leaves_no_stop_that_its_page_has_not_seen() {
+    let mut bench = driving();
+    bench.changed(RobotState::Stopped, Cause::OperatorStop, 4);
+    bench.last_note();
+    let snapshot = bench.port.snapshots.borrow().clone();
+    let seen = snapshot.robot.as_ref().unwrap();
+    assert_eq!((seen.state.as_str(), seen.changes), ("Stopped", 4));
+    let changes = seen.changes;
+    bench.says(2, Command::Reset { changes });
+    assert_eq!(
+        bench.control.pop(),
+        Some(OperatorControl::Reset { changes })
+    );
+    bench.changed(RobotState::Ready, Cause::Requested, 5);
+    bench.changed(RobotState::Stopped, Cause::OperatorStop, 6);
+    bench.says(1, Command::Reset { changes });
+    assert!(!matches!(
+        bench.control.last(),
+        Some(OperatorControl::Reset { .. })
+    ));
+    assert!(bench.last_note().contains("reset again"));
+    bench.says(1, Command::Reset { changes: 6 });
+    assert_eq!(
+        bench.control.pop(),
+        Some(OperatorControl::Reset { changes: 6 })
+    );
 }
 
 #[test]
@@ -436,7 +469,7 @@ fn without_a_link_only_a_stop_is_kept() {
     };
     for command in [
         hold,
-        Command::Reset {},
+        Command::Reset { changes: 1 },
         Command::Learn { name: "arc".into() },
     ] {
         assert!(live.handle(now, 1, Said::Command(command), None).is_none());

@@ -5,10 +5,12 @@ use std::net::TcpStream;
 use std::sync::Arc;
 use std::time::Duration;
 
+use telemime_endpoint::http::Limits;
 use tokio::sync::{mpsc, watch};
 
 use super::super::live::Port;
-use super::super::{Command, Said, Snapshot, serve};
+use super::super::server::serve_within;
+use super::super::{Command, Said, ServeError, Snapshot, serve};
 
 struct Served {
     at: String,
@@ -22,13 +24,17 @@ fn served(addr: &str) -> Served {
 }
 
 fn served_with_room(addr: &str, room: usize) -> Served {
+    served_by(room, |port| serve(addr.parse().unwrap(), [7; 16], port))
+}
+
+fn served_by(room: usize, serve: impl FnOnce(Port) -> Result<String, ServeError>) -> Served {
     let (commands, heard) = mpsc::channel(room);
     let (snapshots, shown) = watch::channel(Arc::default());
     let port = Port {
         commands,
         snapshots: shown,
     };
-    let url = serve(addr.parse().unwrap(), [7; 16], port).unwrap();
+    let url = serve(port).unwrap();
     let at = url.strip_prefix("http://").unwrap();
     let (at, rest) = at.split_once('/').unwrap();
     Served {
@@ -42,9 +48,9 @@ fn served_with_room(addr: &str, room: usize) -> Served {
 impl Served {
     fn connect(&self) -> TcpStream {
         let stream = TcpStream::connect(&self.at).unwrap();
-        stream
-            .set_read_timeout(Some(Duration::from_secs(60)))
-            .unwrap();
+        let patience = Some(Duration::from_secs(60));
+        stream.set_read_timeout(patience).unwrap();
+        stream.set_write_timeout(patience).unwrap();
         stream
     }
 
@@ -246,6 +252,78 @@ fn a_page_that_says_too_much_is_left() {
     assert!(farewell(&mut page).contains("400 commands"));
 }
 
+/// Says goodbye as well as a page that has been left, and returns all that the daemon was to hear until it was.
+fn heard_of(mut page: BufReader<TcpStream>, served: &mut Served) -> Vec<Said> {
+    page.get_mut().write_all(&[0x88, 0x80, 0, 0, 0, 0]).unwrap();
+    let mut rest = Vec::new();
+    let _ = page.read_to_end(&mut rest);
+    std::iter::from_fn(|| served.commands.try_recv().ok())
+        .map(|(_, said)| said)
+        .collect()
+}
+
+#[test]
+fn a_stop_behind_what_a_page_is_left_for_is_obeyed() {
+    let stop = Said::Command(Command::Stop {});
+    for (many, what, why) in [
+        (500, r#"{"do":"alive"}"#, "400 commands"),
+        (25, "{}", "not a command"),
+    ] {
+        let mut served = served_with_room("127.0.0.1:0", 1000);
+        let mut page = served.page();
+        for _ in 0..many {
+            say(&mut page, what);
+        }
+        say(&mut page, r#"{"do":"stop"}"#);
+        assert!(farewell(&mut page).contains(why));
+        let heard = heard_of(page, &mut served);
+        assert_eq!(heard.last(), Some(&stop), "{why}");
+    }
+}
+
+#[test]
+fn stop_is_never_said_too_often() {
+    let mut served = served_with_room("127.0.0.1:0", 1000);
+    let mut page = served.page();
+    for _ in 0..500 {
+        say(&mut page, r#"{"do":"stop"}"#);
+    }
+    let heard = heard_of(page, &mut served);
+    let stops = heard
+        .iter()
+        .filter(|said| **said == Said::Command(Command::Stop {}));
+    assert_eq!(stops.count(), 500);
+}
+
+/// The page vanishes while its stop still waits for a daemon that is behind.
+#[test]
+fn a_stop_that_waits_outlives_its_page() {
+    let mut served = served_with_room("127.0.0.1:0", 1);
+    let mut page = served.page();
+    say(&mut page, r#"{"do":"stop"}"#);
+    frame(&mut page);
+    drop(page);
+    // Until its snapshots are written to nobody.
+    while served.snapshots.receiver_count() > 1 {
+        served.snapshots.send_replace(Arc::default());
+        std::thread::yield_now();
+    }
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_time()
+        .build()
+        .unwrap();
+    let all = async {
+        while let Some((_, said)) = served.commands.recv().await {
+            if said == Said::Command(Command::Stop {}) {
+                return;
+            }
+        }
+    };
+    let within = Duration::from_secs(30);
+    let heard = runtime.block_on(async { tokio::time::timeout(within, all).await });
+    assert!(heard.is_ok(), "the stop was dropped");
+}
+
 /// Nobody reads: snapshots take each other's place, and none of them waits anywhere.
 #[test]
 fn a_page_that_stalls_loses_snapshots_and_holds_up_nothing() {
@@ -301,6 +379,39 @@ fn who_connects_and_asks_for_nothing_keeps_nobody_out() {
     let idle: Vec<_> = (0..64).map(|_| served.connect()).collect();
     assert!(served.get("/", &served.host()).starts_with("HTTP/1.1 200"));
     drop(idle);
+}
+
+/// All places are taken by who asks and asks and reads no answer; a page is none of them.
+#[test]
+fn who_reads_no_answer_keeps_nobody_out_and_a_page_may_stay() {
+    let limits = Limits {
+        connections: 2,
+        request: Duration::from_secs(5),
+        stay: Duration::from_millis(300),
+    };
+    let served = served_by(64, |port| {
+        serve_within(limits, "127.0.0.1:0".parse().unwrap(), [7; 16], port)
+    });
+    let mut page = served.page();
+    let asks = format!("GET / HTTP/1.1\r\n{}\r\n", served.host());
+    let asking: Vec<_> = (0..limits.connections)
+        .map(|_| {
+            let (mut stream, asks) = (served.connect(), asks.clone());
+            std::thread::spawn(move || while stream.write_all(asks.as_bytes()).is_ok() {})
+        })
+        .collect();
+    for asking in asking {
+        asking.join().unwrap();
+    }
+    assert!(served.get("/", &served.host()).starts_with("HTTP/1.1 200"));
+    served.snapshots.send_replace(Arc::new(Snapshot {
+        t: 7.0,
+        ..Snapshot::default()
+    }));
+    let mut told = String::new();
+    while !told.contains(r#""t":7.0"#) {
+        told = String::from_utf8(frame(&mut page).1).unwrap();
+    }
 }
 
 #[test]

@@ -17,6 +17,10 @@ fn what_the_page_says_is_understood() {
     for (text, command) in [
         (r#"{"do":"stop"}"#, Command::Stop {}),
         (
+            r#"{"do":"reset","changes":7}"#,
+            Command::Reset { changes: 7 },
+        ),
+        (
             r#"{"do":"predict","gain":0.5}"#,
             Command::Predict { gain: 0.5 },
         ),
@@ -47,6 +51,7 @@ fn what_is_no_command_is_refused_and_says_why() {
         ("[]", "not a command"),
         (r#"{"do":"dance"}"#, "dance"),
         (r#"{"do":"stop","now":true}"#, "now"),
+        (r#"{"do":"reset"}"#, "changes"),
         (r#"{"do":"hand","t":0,"x":[0,0]}"#, "not a command"),
         (r#"{"do":"hand","t":0,"x":[0,0,1e999]}"#, "not a command"),
         (r#"{"do":"hand","t":0,"x":[0,0,NaN]}"#, "not a command"),
