@@ -180,9 +180,15 @@ class Person {
         return telemime.drive.what === null && robot?.state === "Ready" && "let go";
       });
       if ((await seen.jsonValue()) === "engaged") return at;
-      await this.pointer.up();
+      await this.catchesUp();
     }
     assert.fail("the clutch was let go five times before the arm followed");
+  }
+
+  /** Lets go, and waits until a page that was behind shows where the arm is now: who takes hold of where it was would add that way to the next. */
+  async catchesUp() {
+    await this.pointer.up();
+    await this.until((t) => telemime.link.now?.arm?.t > t + 1000, await this.now("arm.t"));
   }
 
   /** Drags the hand along `path` until the arm is there, still holding it; to the same place however often it is let go on the way. */
@@ -194,7 +200,7 @@ class Person {
       await this.move(at, ms, towards(begun, at, path));
       if (await this.arrives()) return;
       console.log(`  let go by a page that was silent for too long (${tries})`);
-      await this.pointer.up();
+      await this.catchesUp();
     }
     assert.fail("the clutch was let go five times");
   }
@@ -226,6 +232,7 @@ class Person {
       const letGo = this.until(() => telemime.drive.what === null).then(() => false, () => false);
       seen = await Promise.race([taken.then(() => true), letGo]);
       await this.released();
+      if (!seen) await this.catchesUp();
     }
   }
 
