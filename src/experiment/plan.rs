@@ -123,14 +123,7 @@ pub(super) enum Problem {
 
 /// Keys of `motion` that mean something for generated people only, and beside `folders` only.
 const OF_GENERATED: [&str; 3] = ["people", "performances", "wrist"];
-const OF_RECORDED: [&str; 6] = [
-    "off_model",
-    "match",
-    "group_by",
-    "learn_from",
-    "every",
-    "axes",
-];
+const OF_RECORDED: [&str; 5] = ["off_model", "match", "group_by", "learn_from", "every"];
 
 type Value<'a> = Spanned<DeValue<'a>>;
 
@@ -307,7 +300,7 @@ impl Reader<'_> {
                     }
                 }
                 other => {
-                    let known = "people, performances, wrist; or folders, off_model, match, group_by, learn_from, every, axes";
+                    let known = "people, performances, wrist; or folders, off_model, match, group_by, learn_from, every; and axes";
                     return Err(self.unknown(key.span(), other, known));
                 }
             }

@@ -62,6 +62,12 @@ fn what_is_said_of_one_direction_counts_wherever_it_stands() {
 }
 
 #[test]
+fn axes_are_those_of_generated_hands_too() {
+    let plan = parse("[motion]\npeople = 2\naxes = \"base\"\n").unwrap();
+    assert_eq!(plan.motion.axes, Axes::Base);
+}
+
+#[test]
 fn what_is_wrong_is_named_with_its_line() {
     for (text, said) in [
         ("[factors]\ndelay = 3\n", "a.toml:2: unknown factor `delay`"),
